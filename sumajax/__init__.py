@@ -1,0 +1,1 @@
+"""Multi-agent reinforcement learning scaled by state upsampling, as one compiled JAX program."""

@@ -1,0 +1,7 @@
+"""Grid-world domains as pure functions; they know nothing of policies or learning."""
+
+from sumajax.environments.predator_capture_prey import PredatorCapturePrey
+from sumajax.environments.predator_prey import PredatorPrey
+from sumajax.environments.types import Environment, Observation, Transition
+
+__all__ = ["Environment", "Observation", "PredatorCapturePrey", "PredatorPrey", "Transition"]

@@ -1,0 +1,329 @@
+"""Predator-Capture-Prey (PCP), and with it the engine of Predator-Prey, its case without capture agents.
+
+Predators with limited sight and blind capture agents look for one stationary prey. Everybody must
+reach it, and each capture agent must then also capture it. Source: Seraj et al. 2022 (HetNet) and
+its published program; Singh et al. 2019 (IC3Net) for the predators' part.
+
+`reset`, `step`, `observe` and the rest are plain functions of a frozen configuration; the methods of
+`PredatorCapturePrey` only call them.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal, get_args
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.typing import ArrayLike
+
+from sumajax.environments import grid
+from sumajax.environments.types import Observation, Transition
+
+STEP_REWARD = -0.05
+"""Per agent and step while its work is not done (the originals' TIMESTEP_PENALTY)."""
+PREY_REWARD = 0.05
+"""Per agent on the prey in the cooperative and competitive modes (POS_PREY_REWARD)."""
+NEAR_CAPTURE_REWARD = -0.025
+"""Second reward scheme: a capture agent that stands on the prey but has not captured it."""
+
+PREDATOR, CAPTURER = 0, 1
+
+RewardMode = Literal["mixed", "cooperative", "competitive"]
+CaptureReward = Literal["default", "second"]
+
+
+@struct.dataclass
+class State:
+    """One episode in progress. N agents: predators first, then capture agents."""
+
+    agents: chex.Array  # (N, 2) int32 cells
+    prey: chex.Array  # (2,) int32 cell
+    reached: chex.Array  # (N,) bool: has stood on the prey; such an agent never moves again
+    captured: chex.Array  # (N,) bool: nothing left to capture; true for predators from the start
+    time: chex.Array  # () int32 steps taken so far
+
+
+@dataclass(frozen=True)
+class PredatorCapturePrey:
+    """Configuration of the task, and its functions as methods.
+
+    Attributes:
+      size: side of a square grid, or (rows, columns).
+      num_predators, num_capturers: team sizes; either may be 0, not both.
+      vision: how many cells a predator sees in each direction; smaller than the grid's sides.
+      max_steps: step limit of an episode.
+      reward_mode: `mixed` pays -0.05 until an agent is done and ends with the team; `cooperative`
+        and `competitive` pay on the prey and always run to the step limit.
+      capture_reward: `default`, or `second`: only half the penalty on the prey before capturing.
+      capture_vision: how far capture agents see, at most `vision`; None: they are blind.
+
+    Raises:
+      ValueError: for a value out of range; the sentence names it and the mend.
+    """
+
+    size: int | tuple[int, int] = 5
+    num_predators: int = 2
+    num_capturers: int = 1
+    vision: int = 1
+    max_steps: int = 80
+    reward_mode: RewardMode = "mixed"
+    capture_reward: CaptureReward = "default"
+    capture_vision: int | None = None
+
+    entities: ClassVar[tuple[str, ...]] = ("predators", "capturers", "prey")
+    num_actions: ClassVar[int] = 6
+
+    def __post_init__(self) -> None:
+        if isinstance(self.size, list):
+            object.__setattr__(self, "size", tuple(self.size))
+        _validate(self)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return grid.grid_size(self.size)
+
+    @property
+    def num_agents(self) -> int:
+        return self.num_predators + self.num_capturers
+
+    @property
+    def agent_class(self) -> np.ndarray:
+        return np.repeat(
+            np.array([PREDATOR, CAPTURER], np.int32), [self.num_predators, self.num_capturers]
+        )
+
+    @property
+    def action_mask(self) -> np.ndarray:
+        mask = np.ones((self.num_agents, self.num_actions), bool)
+        mask[self.agent_class == PREDATOR, grid.CAPTURE :] = False
+        return mask
+
+    @property
+    def state_shape(self) -> tuple[int, int, int]:
+        return (1, *self.shape)
+
+    @property
+    def view_shape(self) -> tuple[int, int, int]:
+        side = 2 * self.vision + 1
+        return (len(self.entities), side, side)
+
+    @property
+    def sighted_classes(self) -> tuple[bool, ...]:
+        return (True, self.capture_vision is not None)
+
+    def reset(self, key: chex.PRNGKey) -> State:
+        return reset(self, key)
+
+    def state_at(self, agents: ArrayLike, prey: ArrayLike) -> State:
+        return state_at(self, agents, prey)
+
+    def step(self, state: State, actions: chex.Array) -> tuple[State, Transition]:
+        return step(self, state, actions)
+
+    def observe(self, state: State) -> Observation:
+        return observe(self, state)
+
+    def view(self, state: State) -> chex.Array:
+        return view(self, state)
+
+    def state_index(self, state: State) -> chex.Array:
+        return grid.cell_index(state.agents, self.shape)
+
+    def state_table(self) -> chex.Array:
+        return grid.one_hot_cells(self.shape)
+
+    def active(self, state: State) -> chex.Array:
+        return active(self, state)
+
+
+def reset(env: PredatorCapturePrey, key: chex.PRNGKey) -> State:
+    """A fresh episode: agents and prey on distinct cells, every placement equally likely."""
+    cells = grid.place_distinct(key, env.num_agents + 1, env.shape)
+    return _start(env, cells[:-1], cells[-1])
+
+
+def state_at(env: PredatorCapturePrey, agents: ArrayLike, prey: ArrayLike) -> State:
+    """A chosen start, for tests and replays: agents (N, 2), prey (2,), distinct from every agent.
+
+    Raises:
+      ValueError: when a cell lies outside the grid or an agent starts on the prey; checked only
+        for concrete values, since a traced value is not known yet.
+    """
+    agents, prey = jnp.asarray(agents, jnp.int32), jnp.asarray(prey, jnp.int32)
+    if agents.shape != (env.num_agents, 2) or prey.shape != (2,):
+        raise ValueError(
+            f"state_at needs agents of shape ({env.num_agents}, 2) and prey of shape (2,), "
+            f"got {agents.shape} and {prey.shape}."
+        )
+    if not _is_traced(agents, prey):
+        for name, cells in (("agent", np.asarray(agents)), ("prey", np.asarray(prey)[None])):
+            outside = (cells < 0).any(-1) | (cells >= np.array(env.shape)).any(-1)
+            if outside.any():
+                raise ValueError(
+                    f"{name} cell {tuple(cells[outside][0].tolist())} lies outside the "
+                    f"{env.shape[0]}x{env.shape[1]} grid; rows and columns count from 0."
+                )
+        if (np.asarray(agents) == np.asarray(prey)).all(-1).any():
+            raise ValueError(
+                f"an agent starts on the prey at {tuple(np.asarray(prey).tolist())}; "
+                "agents must start elsewhere."
+            )
+    return _start(env, agents, prey)
+
+
+def step(
+    env: PredatorCapturePrey, state: State, actions: chex.Array
+) -> tuple[State, Transition]:
+    """One step of the whole team, without a reset at the end.
+
+    Args:
+      actions: (N,) int32: 0 up, 1 right, 2 down, 3 left, 4 stay, 5 capture (means something only to
+        a capture agent that already stands on the prey). Concrete values are checked; a traced
+        value out of range is a stay.
+
+    Raises:
+      ValueError: for a concrete action out of range or a wrong shape.
+    """
+    actions = _checked_actions(env, actions)
+    can_capture = jnp.asarray(env.agent_class == CAPTURER)
+    was_on_prey = (state.agents == state.prey).all(-1)
+    captured = state.captured | (can_capture & was_on_prey & (actions == grid.CAPTURE))
+    moved = grid.move(state.agents, actions, env.shape)
+    agents = jnp.where(state.reached[:, None], state.agents, moved)
+    on_prey = (agents == state.prey).all(-1)
+    reached = state.reached | on_prey
+    time = state.time + 1
+    success = (on_prey & captured).all()
+    terminated = success if env.reward_mode == "mixed" else jnp.zeros_like(success)
+    transition = Transition(
+        reward=_reward(env, on_prey, captured),
+        terminated=terminated,
+        truncated=(time == env.max_steps) & ~terminated,
+        success=success,
+        steps_taken=time,
+    )
+    next_state = State(agents, state.prey, reached, captured, time)
+    return next_state, transition
+
+
+def observe(env: PredatorCapturePrey, state: State) -> Observation:
+    """Own cell one-hot (N, 1, rows, columns) and entity counts around each agent (N, c, m, m)."""
+    return Observation(
+        state=grid.one_hot_position(state.agents, env.shape), view=view(env, state)
+    )
+
+
+def view(env: PredatorCapturePrey, state: State) -> chex.Array:
+    """(N, c, m, m) float32: counts of predators, (PCP: capture agents) and prey around each agent.
+
+    Cells outside the grid are -1 in every channel. A blind agent reads zeros; one with less vision
+    than the window reads -1 beyond it.
+    """
+    cells = {
+        "predators": state.agents[: env.num_predators],
+        "capturers": state.agents[env.num_predators :],
+        "prey": state.prey[None],
+    }
+    counts = [grid.window_count(state.agents, cells[name], env.vision) for name in env.entities]
+    outside = grid.window_outside(state.agents, env.vision, env.shape)
+    seen = jnp.where(outside[:, None], grid.OUTSIDE, jnp.stack(counts, axis=1))
+    if env.num_capturers == 0:
+        return seen
+    is_capturer = (env.agent_class == CAPTURER)[:, None, None, None]
+    if env.capture_vision is None:
+        return jnp.where(is_capturer, 0.0, seen)
+    beyond = np.abs(grid.window_offsets(env.vision)).max(-1) > env.capture_vision
+    return jnp.where(is_capturer & beyond, grid.OUTSIDE, seen)
+
+
+def active(env: PredatorCapturePrey, state: State) -> chex.Array:
+    """(N,) bool: not yet on the prey, or on it with the capture still to do."""
+    return ~(state.reached & state.captured)
+
+
+def _start(env: PredatorCapturePrey, agents: chex.Array, prey: chex.Array) -> State:
+    return State(
+        agents=agents,
+        prey=prey,
+        reached=jnp.zeros(env.num_agents, bool),
+        captured=jnp.asarray(env.agent_class != CAPTURER),
+        time=jnp.zeros((), jnp.int32),
+    )
+
+
+def _reward(env: PredatorCapturePrey, on_prey: chex.Array, captured: chex.Array) -> chex.Array:
+    """(N,) float32 from the flags after the step, the capturing step itself already paid as done."""
+    team_on_prey = on_prey.sum()
+    paid_on_prey = {
+        "mixed": jnp.float32(0.0),
+        "cooperative": PREY_REWARD * team_on_prey,
+        "competitive": PREY_REWARD / jnp.maximum(team_on_prey, 1),
+    }[env.reward_mode]
+    waiting = NEAR_CAPTURE_REWARD if env.capture_reward == "second" else STEP_REWARD
+    reward = jnp.where(on_prey, jnp.where(captured, paid_on_prey, waiting), STEP_REWARD)
+    return reward.astype(jnp.float32)
+
+
+def _is_traced(*arrays: chex.Array) -> bool:
+    return any(isinstance(array, jax.core.Tracer) for array in arrays)
+
+
+def _checked_actions(env: PredatorCapturePrey, actions: chex.Array) -> chex.Array:
+    actions = jnp.asarray(actions)
+    if actions.shape != (env.num_agents,):
+        raise ValueError(
+            f"step needs one action per agent, shape ({env.num_agents},), got {actions.shape}."
+        )
+    if not _is_traced(actions):
+        wrong = (np.asarray(actions) < 0) | (np.asarray(actions) >= env.num_actions)
+        if wrong.any():
+            raise ValueError(
+                f"action {np.asarray(actions)[wrong][0]} of agent {int(wrong.argmax())} is not one "
+                f"of the {env.num_actions} actions 0..{env.num_actions - 1}."
+            )
+    return actions
+
+
+def _validate(env: PredatorCapturePrey) -> None:
+    rows, columns = _checked_size(env.size)
+    for name in ("num_predators", "num_capturers", "vision", "max_steps"):
+        value = getattr(env, name)
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+            raise ValueError(f"{name} must be a whole number, got {value!r}.")
+    for name, least in (("num_predators", 0), ("num_capturers", 0), ("vision", 0), ("max_steps", 1)):
+        if getattr(env, name) < least:
+            raise ValueError(f"{name} must be at least {least}, got {getattr(env, name)}.")
+    if env.num_agents < 1:
+        raise ValueError("the team is empty; give at least one predator or capture agent.")
+    if env.num_agents + 1 > rows * columns:
+        raise ValueError(
+            f"{env.num_agents} agents and a prey need {env.num_agents + 1} distinct cells, but a "
+            f"{rows}x{columns} grid has {rows * columns}; use fewer agents or a larger grid."
+        )
+    if env.vision >= min(rows, columns):
+        raise ValueError(
+            f"vision {env.vision} must be smaller than the sides of the {rows}x{columns} grid; "
+            f"use at most {min(rows, columns) - 1}."
+        )
+    for name, choices in (("reward_mode", RewardMode), ("capture_reward", CaptureReward)):
+        if getattr(env, name) not in get_args(choices):
+            raise ValueError(
+                f"{name} {getattr(env, name)!r} is unknown; choose one of "
+                f"{', '.join(get_args(choices))}."
+            )
+    if env.capture_vision is not None and not 0 <= env.capture_vision <= env.vision:
+        raise ValueError(
+            f"capture_vision {env.capture_vision} must lie between 0 and vision {env.vision}, "
+            "or be None for blind capture agents."
+        )
+
+
+def _checked_size(size: int | tuple[int, int]) -> tuple[int, int]:
+    sides = size if isinstance(size, tuple) else (size,)
+    whole = all(isinstance(side, (int, np.integer)) and not isinstance(side, bool) for side in sides)
+    if not whole or len(sides) > 2 or min(sides, default=0) < 1:
+        raise ValueError(f"size must be a positive int or (rows, columns), got {size!r}.")
+    return grid.grid_size(size)

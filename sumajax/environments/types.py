@@ -1,0 +1,90 @@
+"""What every domain offers: the `Environment` contract and the two records that cross it."""
+
+from typing import Any, Protocol, runtime_checkable
+
+import chex
+import numpy as np
+from flax import struct
+
+
+@struct.dataclass
+class Observation:
+    """What the agents know before they act (paper section IV-A, IV-C).
+
+    Axes: N agents, (rows, columns) of the policy's grid, c entity channels, m = 2 vision + 1.
+    """
+
+    state: chex.Array  # (N, 1, rows, columns) float32: the agent's own cell, one-hot (or upsampled)
+    view: chex.Array  # (N, c, m, m) float32: entity counts around the agent, -1 outside the grid
+
+
+@struct.dataclass
+class Transition:
+    """What one step did to the team. `terminated` and `truncated` are never both true."""
+
+    reward: chex.Array  # (N,) float32: individual rewards of this step
+    terminated: chex.Array  # () bool: the team is done
+    truncated: chex.Array  # () bool: the step limit was hit without being done
+    success: chex.Array  # () bool: the completion condition holds after this step, in every mode
+    steps_taken: chex.Array  # () int32: steps of this episode so far, this one included
+
+
+@runtime_checkable
+class Environment(Protocol):
+    """A cooperative task on a grid, as frozen configuration plus pure functions.
+
+    No function keeps state, resets on its own or needs a key after `reset`: all of them can be
+    traced, vmapped and scanned. Policies read shapes and classes; the learner reads the rest.
+    """
+
+    max_steps: int
+    """The step limit of an episode."""
+
+    @property
+    def num_agents(self) -> int:
+        """N."""
+
+    @property
+    def num_actions(self) -> int:
+        """Size of the action space shared by all agents; `action_mask` narrows it."""
+
+    @property
+    def agent_class(self) -> np.ndarray:
+        """(N,) int32: class of each agent, 0 for the first class; classes are contiguous."""
+
+    @property
+    def action_mask(self) -> np.ndarray:
+        """(N, num_actions) bool: the actions that mean something to an agent."""
+
+    @property
+    def state_shape(self) -> tuple[int, int, int]:
+        """(1, rows, columns) of `Observation.state`."""
+
+    @property
+    def view_shape(self) -> tuple[int, int, int]:
+        """(c, m, m) of `Observation.view`."""
+
+    @property
+    def sighted_classes(self) -> tuple[bool, ...]:
+        """For each agent class, whether its `view` carries information (blind ones read zeros)."""
+
+    def reset(self, key: chex.PRNGKey) -> Any:
+        """A fresh episode."""
+
+    def step(self, state: Any, actions: chex.Array) -> tuple[Any, Transition]:
+        """One step of the whole team; `actions` is (N,) int32."""
+
+    def observe(self, state: Any) -> Observation:
+        """What the agents see now; equals `state_table()[state_index(state)]` and `view(state)`."""
+
+    def view(self, state: Any) -> chex.Array:
+        """(N, c, m, m): the `view` part of `observe` alone."""
+
+    def state_index(self, state: Any) -> chex.Array:
+        """(N,) int32: the row of `state_table()` that is each agent's state tensor."""
+
+    def state_table(self) -> chex.Array:
+        """(S, 1, rows, columns): every state tensor that can occur, so each is encoded only once."""
+
+    def active(self, state: Any) -> chex.Array:
+        """(N,) bool: agents whose next action can still change anything."""

@@ -1,0 +1,49 @@
+"""Communication policies; they know nothing of learning.
+
+A policy of your own needs no entry here: `Policy("mine", MyModule(TeamSpec.of(env)))` is one.
+"""
+
+from typing import Any
+
+from sumajax.environments.types import Environment
+from sumajax.policies import ic3net
+from sumajax.policies.encoder import ENCODERS
+from sumajax.policies.types import Decision, Policy, PolicyModule, PolicyOutput, TeamSpec
+
+__all__ = [
+    "POLICIES",
+    "Decision",
+    "Policy",
+    "PolicyModule",
+    "PolicyOutput",
+    "TeamSpec",
+    "make_policy",
+]
+
+POLICIES: dict[str, tuple[type[PolicyModule], dict[str, Any]]] = {**ic3net.VARIANTS}
+"""Every named policy: its module and the settings that make it this variant."""
+
+
+def make_policy(name: str, env: Environment, **settings: Any) -> Policy:
+    """The policy called `name`, shaped for `env`.
+
+    Args:
+      settings: fields of the policy's module, as `hidden=128` or `encoder="flat"`.
+
+    Raises:
+      ValueError: for an unknown name or setting, with what there is.
+    """
+    if name not in POLICIES:
+        raise ValueError(f"policy {name!r} is unknown; choose one of {', '.join(POLICIES)}.")
+    module, variant = POLICIES[name]
+    known = set(module.__dataclass_fields__) - {"team", "parent", "name"} - set(variant)
+    unknown = sorted(set(settings) - known)
+    if unknown:
+        raise ValueError(
+            f"policy {name!r} has no setting {unknown[0]!r}; it has {', '.join(sorted(known))}."
+        )
+    if settings.get("encoder", "flat") not in ENCODERS:
+        raise ValueError(
+            f"encoder {settings['encoder']!r} is unknown; choose one of {', '.join(ENCODERS)}."
+        )
+    return Policy(name, module(team=TeamSpec.of(env), **variant, **settings))

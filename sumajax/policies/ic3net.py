@@ -1,0 +1,157 @@
+"""IC3Net and its special cases CommNet, IRIC and IC (Singh et al. 2019; Sukhbaatar et al. 2016).
+
+Agents pass the mean of each other's hidden states through a dense layer into a shared LSTM; in
+IC3Net each agent also decides, by a gate sampled one step ahead, whether it takes part at all.
+"""
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from flax import struct
+
+from sumajax.policies.encoder import (
+    STATE_FEATURES,
+    VIEW_FEATURES,
+    EncoderKind,
+    StateEncoder,
+    ViewEncoder,
+)
+from sumajax.policies.layers import Dense, LSTMCell
+from sumajax.policies.types import (
+    MASKED_LOGIT,
+    Decision,
+    PolicyModule,
+    PolicyOutput,
+    decide,
+)
+
+SILENT, TALK = 0, 1
+
+
+@struct.dataclass
+class IC3NetCarry:
+    """What the agents remember."""
+
+    h: chex.Array  # (..., N, H) LSTM hidden state, the messages of the next step
+    s: chex.Array  # (..., N, H) LSTM cell
+    gate: chex.Array  # (..., N) float32: 1 where the agent chose to take part in the next step
+
+
+class IC3NetCore(nn.Module):
+    """One step from encoded observations: messages, LSTM, heads (algorithms.md 1.1)."""
+
+    hidden: int
+    num_actions: int
+    communicates: bool = True
+    gated: bool = True
+    comm_passes: int = 1
+
+    def setup(self) -> None:
+        passes = self.comm_passes if self.communicates else 0
+        self.C = [Dense(self.hidden) for _ in range(passes)]
+        self.lstm = LSTMCell(self.hidden)
+        self.action = Dense(self.num_actions)
+        self.value = Dense(1)
+        if self.gated:
+            self.gate = Dense(2)
+
+    def __call__(
+        self, carry: IC3NetCarry, x: chex.Array
+    ) -> tuple[chex.Array, chex.Array, dict[str, chex.Array], chex.Array]:
+        """x (..., N, H) -> h, s, logits by decision, value (..., N)."""
+        h, s = carry.h, carry.s
+        for message_layer in self.C:
+            h, s = self.lstm((h, s), x + message_layer(mean_message(h, carry.gate)))
+        if not self.communicates:
+            h, s = self.lstm((h, s), x)
+        logits = {"action": self.action(h)}
+        if self.gated:
+            logits["gate"] = self.gate(h)
+        return h, s, logits, self.value(h)[..., 0]
+
+
+def mean_message(h: chex.Array, gate: chex.Array) -> chex.Array:
+    """(..., N, H): what each agent hears, sum over talking others of h / (N - 1).
+
+    A silent agent hears nothing either (the published program; the paper's formula gates the sender
+    only), and the mean is over all others, not over those who talk.
+    """
+    others = max(h.shape[-2] - 1, 1)
+    spoken = gate[..., None] * h
+    return gate[..., None] * (spoken.sum(-2, keepdims=True) - spoken) / others
+
+
+class IC3Net(PolicyModule):
+    """IC3Net; with `gated=False` CommNet; with `communicates=False` independent controllers."""
+
+    hidden: int = 128
+    communicates: bool = True
+    gated: bool = True
+    comm_passes: int = 1
+    encoder: EncoderKind = "flat"
+
+    def setup(self) -> None:
+        self.state_encoder = StateEncoder(self.encoder)
+        self.view_encoder = ViewEncoder()
+        # One dense layer on [state features | view features], kept as its two halves so that the
+        # state's half is computed once per cell.
+        fan_in = STATE_FEATURES + VIEW_FEATURES
+        self.merge_state = Dense(self.hidden, fan_in=fan_in)
+        self.merge_view = Dense(self.hidden, use_bias=False, fan_in=fan_in)
+        self.core = IC3NetCore(
+            self.hidden, self.team.num_actions, self.communicates, self.gated, self.comm_passes
+        )
+
+    def encode_states(self, states: chex.Array) -> chex.Array:
+        return self.merge_state(self.state_encoder(states))
+
+    def __call__(
+        self, carry: IC3NetCarry, state_features: chex.Array, view: chex.Array, noise: Any
+    ) -> tuple[IC3NetCarry, PolicyOutput]:
+        sighted = jnp.asarray(self.team.sighted, jnp.float32)[:, None]
+        x = state_features + self.merge_view(self.view_encoder(view) * sighted)
+        talked = carry.gate
+        h, s, logits, value = self.core(carry, x)
+        action_logits = jnp.where(jnp.asarray(self.team.action_mask), logits["action"], MASKED_LOGIT)
+        decisions: dict[str, Decision] = {"action": decide(action_logits, noise["action"])}
+        gate = carry.gate
+        if self.gated:
+            decisions["gate"] = decide(logits["gate"], noise["gate"])
+            gate = decisions["gate"].choice.astype(h.dtype)
+        num_agents = h.shape[-2]
+        pairs = talked[..., :, None] * talked[..., None, :] * (1 - jnp.eye(num_agents))
+        output = PolicyOutput(
+            decisions=decisions,
+            value=value,
+            communication=gate,
+            attention=pairs / max(num_agents - 1, 1),
+        )
+        return IC3NetCarry(h, s, gate), output
+
+    def initial_carry(self, batch_shape: tuple[int, ...]) -> IC3NetCarry:
+        shape = (*batch_shape, self.team.num_agents)
+        zeros = jnp.zeros((*shape, self.hidden))
+        # A gated agent starts silent (irrelevant: h is zero); without a gate everybody always talks.
+        gate = jnp.full(shape, float(self.communicates and not self.gated))
+        return IC3NetCarry(zeros, zeros, gate)
+
+    def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
+        shape = (*batch_shape, self.team.num_agents)
+        action_key, gate_key = jax.random.split(key)
+        noise = {"action": jax.random.gumbel(action_key, (*shape, self.team.num_actions))}
+        if self.gated:
+            noise["gate"] = jax.random.gumbel(gate_key, (*shape, 2))
+        return noise
+
+
+VARIANTS = {
+    "ic3net": (IC3Net, {}),
+    "commnet": (IC3Net, {"gated": False}),
+    "iric": (IC3Net, {"communicates": False, "gated": False}),
+    "ic": (IC3Net, {"communicates": False, "gated": False}),
+}
+"""Names of this file's policies. IC differs from IRIC, and CommNet from IC3Net, also in the reward:
+a team mean, which is a setting of the learner."""

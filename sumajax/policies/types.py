@@ -1,0 +1,180 @@
+"""The contract between policies and everything that uses them.
+
+A policy is a Flax Linen module (`PolicyModule`) that says how one team step is computed; `Policy`
+pairs it with the task's shapes and is what users and the learner hold. All parameters are shared by
+the agents of a class and none depends on how many there are: the same parameters act for any N.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from flax import struct
+
+from sumajax.environments.types import Environment, Observation
+
+MASKED_LOGIT = -1e9
+"""Logit of an action that an agent's class does not have: probability exactly 0 in float32."""
+
+
+@struct.dataclass
+class Decision:
+    """One sampled choice per agent, kept with what it was sampled from."""
+
+    logits: chex.Array  # (..., N, K) float32, unnormalised log-probabilities
+    choice: chex.Array  # (..., N) int32 in 0..K-1
+
+
+@struct.dataclass
+class PolicyOutput:
+    """What a team decided in one step."""
+
+    decisions: dict[str, Decision]  # "action", and whatever else is learnt by policy gradient
+    value: chex.Array  # (..., N) float32: expected return of each agent
+    communication: chex.Array  # (..., N) float32 in [0, 1]: share of its means an agent used to talk
+    attention: chex.Array  # (..., N, N) float32: weight of sender j (column) at receiver i (row)
+
+    @property
+    def action(self) -> chex.Array:
+        """(..., N) int32."""
+        return self.decisions["action"].choice
+
+    @property
+    def logits(self) -> chex.Array:
+        """(..., N, num_actions) float32 of the action."""
+        return self.decisions["action"].logits
+
+
+@dataclass(frozen=True)
+class TeamSpec:
+    """The shapes and classes of a task, as hashable constants a policy is built from."""
+
+    agent_class: tuple[int, ...]  # per agent
+    sighted_classes: tuple[bool, ...]  # per class
+    num_actions: int
+    action_mask: tuple[tuple[bool, ...], ...]  # (N, num_actions)
+    state_shape: tuple[int, int, int]  # (1, rows, columns)
+    view_shape: tuple[int, int, int]  # (c, m, m)
+
+    @classmethod
+    def of(cls, env: Environment) -> "TeamSpec":
+        return cls(
+            agent_class=tuple(env.agent_class.tolist()),
+            sighted_classes=env.sighted_classes,
+            num_actions=env.num_actions,
+            action_mask=tuple(tuple(row) for row in env.action_mask.tolist()),
+            state_shape=env.state_shape,
+            view_shape=env.view_shape,
+        )
+
+    @property
+    def num_agents(self) -> int:
+        return len(self.agent_class)
+
+    @property
+    def sighted(self) -> np.ndarray:
+        """(N,) bool."""
+        return np.array([self.sighted_classes[c] for c in self.agent_class], bool)
+
+    def class_size(self, agent_class: int) -> int:
+        return self.agent_class.count(agent_class)
+
+
+class PolicyModule(nn.Module):
+    """What a policy file implements. `...` stands for any batch axes, usually E environments."""
+
+    team: TeamSpec
+
+    def encode_states(self, states: chex.Array) -> chex.Array:
+        """(S, 1, rows, columns) state tensors -> (S, F) features, whatever `__call__` expects."""
+        raise NotImplementedError
+
+    def __call__(
+        self, carry: Any, state_features: chex.Array, view: chex.Array, noise: Any
+    ) -> tuple[Any, PolicyOutput]:
+        """One team step.
+
+        Args:
+          carry: what the agents remember, from `initial_carry` or the step before.
+          state_features: (..., N, F) rows of `encode_states`.
+          view: (..., N, c, m, m).
+          noise: from `sample_noise`; all zeros make every choice greedy.
+        """
+        raise NotImplementedError
+
+    def initial_carry(self, batch_shape: tuple[int, ...]) -> Any:
+        """Memory at the start of an episode, leading axes `batch_shape`."""
+        raise NotImplementedError
+
+    def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
+        """All the random numbers of `__call__`, so that a rollout can draw them in one go."""
+        raise NotImplementedError
+
+    def encode_and_step(
+        self, carry: Any, obs: Observation, noise: Any
+    ) -> tuple[Any, PolicyOutput]:
+        """`__call__` on the state tensors themselves: the direct path, for any state."""
+        flat = obs.state.reshape(-1, *obs.state.shape[-3:])
+        features = self.encode_states(flat).reshape(*obs.state.shape[:-3], -1)
+        return self(carry, features, obs.view, noise)
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A named policy for a task; all methods are pure and can be traced."""
+
+    name: str
+    module: PolicyModule
+
+    @property
+    def team(self) -> TeamSpec:
+        return self.module.team
+
+    def init(self, key: chex.PRNGKey) -> Any:
+        """Fresh parameters."""
+        team = self.team
+        obs = Observation(
+            state=jnp.zeros((team.num_agents, *team.state_shape)),
+            view=jnp.zeros((team.num_agents, *team.view_shape)),
+        )
+        noise = jax.tree.map(jnp.zeros_like, self.sample_noise(key, ()))
+        return self.module.init(
+            key, self.initial_carry(), obs, noise, method=self.module.encode_and_step
+        )
+
+    def initial_carry(self, batch_shape: tuple[int, ...] = ()) -> Any:
+        """Memory at the start of an episode."""
+        return self.module.initial_carry(batch_shape)
+
+    def apply(
+        self, params: Any, carry: Any, obs: Observation, key: chex.PRNGKey
+    ) -> tuple[Any, PolicyOutput]:
+        """One step of the team: obs.state (..., N, 1, rows, columns), obs.view (..., N, c, m, m)."""
+        chex.assert_shape(obs.state, (..., *self.team.state_shape))
+        chex.assert_shape(obs.view, (..., *self.team.view_shape))
+        noise = self.sample_noise(key, obs.view.shape[:-4])
+        return self.module.apply(params, carry, obs, noise, method=self.module.encode_and_step)
+
+    def encode_states(self, params: Any, states: chex.Array) -> chex.Array:
+        """(S, 1, rows, columns) -> (S, F), for `step`."""
+        return self.module.apply(params, states, method=self.module.encode_states)
+
+    def step(
+        self, params: Any, carry: Any, state_features: chex.Array, view: chex.Array, noise: Any
+    ) -> tuple[Any, PolicyOutput]:
+        """`apply` with the state already encoded and the random numbers already drawn."""
+        return self.module.apply(params, carry, state_features, view, noise)
+
+    def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
+        """The random numbers of `batch_shape` steps."""
+        return self.module.sample_noise(key, batch_shape)
+
+
+def decide(logits: chex.Array, gumbel: chex.Array) -> Decision:
+    """A categorical sample by the Gumbel-max trick; zero noise takes the likeliest choice."""
+    choice = jnp.argmax(jax.lax.stop_gradient(logits) + gumbel, axis=-1)
+    return Decision(logits=logits, choice=choice.astype(jnp.int32))

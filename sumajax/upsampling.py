@@ -1,0 +1,127 @@
+"""State upsampling: the operator phi and the task that it makes (paper sections IV-A and IV-B)."""
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import chex
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from sumajax.environments.grid import grid_size
+from sumajax.environments.types import Environment, Observation, Transition
+
+Scale = Literal["none", "mass"]
+
+
+def upsample(state: chex.Array, factor: int | tuple[int, int]) -> chex.Array:
+    """Nearest-neighbour upsampling: (..., p, p) -> (..., p*f, p*f), each cell a block of its value.
+
+    Args:
+      state: (..., rows, columns).
+      factor: f >= 1 for both axes, or (row factor, column factor).
+
+    Source: paper section IV-A, the operator phi.
+    """
+    down, right = (factor, factor) if isinstance(factor, int) else factor
+    if min(down, right) < 1:
+        raise ValueError(f"the upsampling factor must be at least 1, got {factor}.")
+    return jnp.repeat(jnp.repeat(state, down, axis=-2), right, axis=-1)
+
+
+@dataclass(frozen=True)
+class StateUpsampled:
+    """A task seen at another task's size: the SUMA-POMDP of paper section IV-B.
+
+    N, O, A, T, r and gamma are those of `env`; only the state tensor grows, from `env`'s grid to
+    `size`. With `scale="mass"` a block sums to what its cell held (1/f^2 each), otherwise, as in the
+    paper, each of its cells holds that value.
+
+    Raises:
+      ValueError: when `size` is not a whole multiple of the grid of `env`.
+    """
+
+    env: Environment
+    size: int | tuple[int, int]
+    scale: Scale = "none"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.size, list):
+            object.__setattr__(self, "size", tuple(self.size))
+        if self.scale not in get_args(Scale):
+            raise ValueError(
+                f"scale {self.scale!r} is unknown; choose one of {', '.join(get_args(Scale))}."
+            )
+        (rows, columns), (source_rows, source_columns) = grid_size(self.size), self.env.state_shape[1:]
+        if min(rows, columns) < 1 or rows % source_rows or columns % source_columns:
+            raise ValueError(
+                f"the target size {rows}x{columns} is not a whole multiple of the source size "
+                f"{source_rows}x{source_columns}; choose sides that divide."
+            )
+
+    @property
+    def factor(self) -> tuple[int, int]:
+        """(row factor, column factor)."""
+        rows, columns = grid_size(self.size)
+        return rows // self.env.state_shape[1], columns // self.env.state_shape[2]
+
+    @property
+    def max_steps(self) -> int:
+        return self.env.max_steps
+
+    @property
+    def num_agents(self) -> int:
+        return self.env.num_agents
+
+    @property
+    def num_actions(self) -> int:
+        return self.env.num_actions
+
+    @property
+    def agent_class(self) -> np.ndarray:
+        return self.env.agent_class
+
+    @property
+    def action_mask(self) -> np.ndarray:
+        return self.env.action_mask
+
+    @property
+    def state_shape(self) -> tuple[int, int, int]:
+        return (1, *grid_size(self.size))
+
+    @property
+    def view_shape(self) -> tuple[int, int, int]:
+        return self.env.view_shape
+
+    @property
+    def sighted_classes(self) -> tuple[bool, ...]:
+        return self.env.sighted_classes
+
+    def reset(self, key: chex.PRNGKey) -> Any:
+        return self.env.reset(key)
+
+    def state_at(self, agents: ArrayLike, prey: ArrayLike) -> Any:
+        return self.env.state_at(agents, prey)  # type: ignore[attr-defined]
+
+    def step(self, state: Any, actions: chex.Array) -> tuple[Any, Transition]:
+        return self.env.step(state, actions)
+
+    def observe(self, state: Any) -> Observation:
+        seen = self.env.observe(state)
+        return seen.replace(state=self._transform(seen.state))  # type: ignore[attr-defined]
+
+    def view(self, state: Any) -> chex.Array:
+        return self.env.view(state)
+
+    def state_index(self, state: Any) -> chex.Array:
+        return self.env.state_index(state)
+
+    def state_table(self) -> chex.Array:
+        return self._transform(self.env.state_table())
+
+    def active(self, state: Any) -> chex.Array:
+        return self.env.active(state)
+
+    def _transform(self, state: chex.Array) -> chex.Array:
+        large = upsample(state, self.factor)
+        return large / (self.factor[0] * self.factor[1]) if self.scale == "mass" else large
