@@ -1,0 +1,822 @@
+"""Checkpoints: the state of a run on disk, written and read by Orbax in this one place.
+
+A checkpoint directory holds the last few checkpoints of one training run, each a directory of its
+own that is complete or absent, never half there:
+
+    <directory>/000004-step-120/         serial number of the save, step (epoch) of the run
+        checkpoint.json                  what it is: format, version, meta, leaves, files, checksum
+        state/                           the arrays, as Orbax wrote them
+
+`checkpoint.json` gives the shape, dtype and SHA-256 of every leaf and the size and SHA-256 of every
+file, and is itself under a checksum, so whatever was truncated, altered or lost is found before
+anything is trained on. Reading executes nothing from the directory, unpickles nothing, and is
+bounded. One program at a time may write to a directory; any number may read.
+"""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import re
+import shutil
+import stat
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments.types import Environment
+from sumajax.policies import POLICIES, Policy, make_policy
+from sumajax.upsampling import StateUpsampled
+
+FORMAT = "sumajax checkpoint"
+VERSION = 1
+"""Of the description; a reader refuses a higher one. The checksum is made the same way in all."""
+
+DESCRIPTION = "checkpoint.json"
+ARRAYS = "state"
+
+MAX_DESCRIPTION_BYTES = 4 * 2**20
+MAX_STATE_BYTES = 8 * 2**30
+"""Of all arrays together, and of all files together, in a checkpoint that will be read."""
+MAX_AGENTS, MAX_CELLS, MAX_SETTING = 10_000, 10_000_000, 100_000
+"""What a task or policy described in a file may ask for before anything is built from it."""
+
+TASKS: dict[str, type] = {
+    cls.__name__: cls for cls in (PredatorPrey, PredatorCapturePrey, StateUpsampled)
+}
+"""Every task `rebuild` may make, by the name a description calls it."""
+
+_NAME = re.compile(r"(\d{6,12})-step-(\d{1,18})")
+_SCRATCH = ".unfinished-"
+_PART = re.compile(r"[\w-]+")
+_WIDTHS = {"int": (8, 16, 32, 64), "uint": (8, 16, 32, 64), "float": (16, 32, 64)}
+_DTYPES = {"bool", "bfloat16", "complex64", "complex128"} | {
+    f"{kind}{width}" for kind, widths in _WIDTHS.items() for width in widths
+}
+_KEYS = {"key<fry>": ("threefry2x32", 2), "key<rbg>": ("rbg", 4), "key<urbg>": ("unsafe_rbg", 4)}
+"""Typed PRNG keys: dtype -> implementation, 32-bit words of a key."""
+
+T = TypeVar("T")
+
+
+class CheckpointError(ValueError):
+    """A checkpoint cannot be written, read or used; the sentence says where, why and the mend."""
+
+
+class _DamagedError(CheckpointError):
+    """This one checkpoint is not what was written; an earlier one may be."""
+
+
+class _Leaf(NamedTuple):
+    """What a leaf is, apart from its values."""
+
+    shape: tuple[int, ...]
+    dtype: str
+
+    def __str__(self) -> str:
+        return f"{self.dtype}{list(self.shape)}"
+
+    @property
+    def stored(self) -> tuple[tuple[int, ...], np.dtype]:
+        """Shape and dtype on disk: a typed key is stored as its words."""
+        if self.dtype in _KEYS:
+            return (*self.shape, _KEYS[self.dtype][1]), np.dtype(np.uint32)
+        return self.shape, jnp.dtype(self.dtype)
+
+    @property
+    def nbytes(self) -> int:
+        shape, dtype = self.stored
+        return math.prod(shape) * dtype.itemsize
+
+
+class _Description(NamedTuple):
+    """A checked `checkpoint.json`."""
+
+    meta: dict[str, Any]
+    leaves: dict[str, _Leaf]
+    digests: dict[str, str]  # SHA-256 by leaf
+    files: dict[str, tuple[int, str]]  # bytes, SHA-256 by path below the checkpoint
+
+
+# --- Save and load ---------------------------------------------------------------------------
+
+
+def save(
+    directory: str | os.PathLike[str],
+    state: Any,
+    meta: dict[str, Any],
+    *,
+    step: int | None = None,
+    keep: int = 3,
+) -> Path:
+    """Writes `state` as the newest checkpoint of `directory` and returns where.
+
+    The checkpoint appears under its name in one rename, when every byte of it is on disk: a kill
+    at any moment leaves the earlier ones as they were. Synchronous: nothing goes on afterwards.
+
+    Args:
+      directory: made if missing; if it holds anything, then checkpoints of ours.
+      state: any pytree of arrays: JAX (on any devices), numpy, typed PRNG keys, Python scalars
+        (saved as the arrays JAX makes of them). Names of its parts: letters, digits, _ and -.
+      meta: what the state is, as JSON (tuples come back as lists); see `describe`.
+      step: number in the name, for people; `meta["epoch"]` (or 0) if not given.
+      keep: how many checkpoints stay, this one included.
+
+    Raises:
+      CheckpointError: for a directory that is not ours or cannot be written, a full disk, a leaf
+        that is no array, a `meta` that is no JSON.
+    """
+    root = Path(directory)
+    step = meta.get("epoch", 0) if step is None else step
+    if isinstance(step, bool) or not isinstance(step, int) or step < 0:
+        raise CheckpointError(f"step must be a whole number of at least 0, got {step!r}.")
+    if isinstance(keep, bool) or not isinstance(keep, int) or keep < 1:
+        raise CheckpointError(f"keep must be a whole number of at least 1, got {keep!r}.")
+    leaves, arrays = _host_arrays(state)
+    try:
+        json.dumps(meta)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"meta must be plain JSON: {_reason(error)}.") from error
+    return _write(_claim(root), leaves, arrays, meta, step, keep)
+
+
+def load(
+    directory: str | os.PathLike[str],
+    like: Any = None,
+    *,
+    say: Callable[[str], None] | None = None,
+) -> tuple[Any, dict[str, Any]]:
+    """The newest good checkpoint, as (state, meta).
+
+    Leaves come back on the host, as numpy arrays (typed keys as key arrays), so a checkpoint does
+    not care how many devices wrote it; place them with `jax.device_put` or pass them to a jitted
+    function.
+
+    Args:
+      directory: what `save` was given, or one of the checkpoints in it.
+      like: a pytree of arrays or of `jax.ShapeDtypeStruct` (`jax.eval_shape`) whose structure the
+        state takes; names, shapes and dtypes are compared before any array is read. None: nested
+        dicts named after the fields, keys and indices of what was saved.
+      say: is told when a damaged checkpoint is passed over for an earlier one; None: a warning.
+
+    Raises:
+      CheckpointError: when there is no checkpoint, none is good, the newest was written by a newer
+        sumajax, or it differs from `like`; names the leaf and both shapes.
+    """
+    return _newest_good(Path(directory), lambda path: _restore(path, like, ""), say)
+
+
+def load_params(
+    directory: str | os.PathLike[str],
+    like_params: Any = None,
+    *,
+    field: str = "params",
+    say: Callable[[str], None] | None = None,
+) -> Any:
+    """Only the parameters (or another `field` of the state) of the newest good checkpoint.
+
+    Arguments, errors and what comes back as for `load`, for that part of the state alone.
+    """
+    found = _newest_good(
+        Path(directory), lambda path: _restore(path, like_params, f"{field}/"), say
+    )
+    return found[0]
+
+
+def read_meta(
+    directory: str | os.PathLike[str], *, say: Callable[[str], None] | None = None
+) -> dict[str, Any]:
+    """What the newest good checkpoint is, without its arrays (their files are checked)."""
+
+    def read(path: Path) -> dict[str, Any]:
+        description = _read_description(path)
+        _verify_files(path, description)
+        return description.meta
+
+    return _newest_good(Path(directory), read, say)
+
+
+def latest(directory: str | os.PathLike[str]) -> Path | None:
+    """Where the newest checkpoint lies, good or not; None when there is none to go on from."""
+    root = Path(directory)
+    if (root / DESCRIPTION).is_file():
+        return root
+    return next(iter(_checkpoints(root)), None)
+
+
+# --- Tasks and policies in words -------------------------------------------------------------
+
+
+def describe(env: Environment, policy: Policy, **more: Any) -> dict[str, Any]:
+    """The `meta` of a policy on a task, for `save`, `rebuild` and `check_compatible`.
+
+    Args:
+      more: preset, seed, epoch and whatever else belongs to the run, as JSON.
+    """
+    cls = type(policy.module)
+    return {
+        "task": _describe_task(env),
+        "policy": {
+            "name": policy.name,
+            "module": _class_name(
+                cls, {module.__name__: module for module, _ in POLICIES.values()}
+            ),
+            "settings": _settings(policy),
+        },
+        "num_agents": env.num_agents,
+        "num_actions": env.num_actions,
+        "state_shape": list(env.state_shape),
+        "view_shape": list(env.view_shape),
+        "versions": {name: _version(name) for name in ("sumajax", "jax", "flax", "optax")},
+        **more,
+    }
+
+
+def rebuild(meta: dict[str, Any]) -> tuple[Environment, Policy]:
+    """The task and the policy of `meta`, made from the names in `TASKS` and `POLICIES` alone.
+
+    Raises:
+      CheckpointError: for a task or policy that is not one of those, or a value it refuses.
+    """
+    try:
+        env = _rebuild_task(meta["task"])
+        name, settings = meta["policy"]["name"], meta["policy"]["settings"]
+        if name not in POLICIES or POLICIES[name][0].__name__ != meta["policy"]["module"]:
+            raise CheckpointError(
+                f"policy {name!r} is not one of {', '.join(POLICIES)}; build it in your program "
+                "and take its parameters with load_params."
+            )
+        return env, make_policy(name, env, **_bounded(settings))
+    except CheckpointError:
+        raise
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise CheckpointError(
+            f"the checkpoint's description of task and policy is not usable: {_reason(error)}; "
+            "save it with meta from describe(env, policy)."
+        ) from error
+
+
+def check_compatible(
+    meta: dict[str, Any],
+    env: Environment,
+    policy: Policy,
+    directory: str | os.PathLike[str] = "the checkpoint",
+) -> None:
+    """Whether the parameters of a checkpoint fit `policy` on `env`; team sizes may differ.
+
+    Args:
+      meta: of the checkpoint, from `describe`.
+      directory: of the checkpoint, for the sentence.
+
+    Raises:
+      CheckpointError: for the first of policy, its settings, vision, observation channels, number
+        of actions, policy grid that differs; names both values and the mend.
+    """
+    try:
+        saved, settings = dict(meta), dict(meta["policy"]["settings"])
+        pairs = list(_compared(saved, settings, env, policy))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise CheckpointError(
+            f"{directory} does not say which task and policy it is of; save it with meta from "
+            "describe(env, policy)."
+        ) from error
+    for what, theirs, ours, mend in pairs:
+        if theirs != ours:
+            raise CheckpointError(
+                f"{what} differs: {theirs} in {directory}, {ours} in this stage; {mend}."
+            )
+
+
+def _compared(
+    saved: dict[str, Any], settings: dict[str, Any], env: Environment, policy: Policy
+) -> Iterator[tuple[str, Any, Any, str]]:
+    """(what, saved value, value here, mend) in the order in which they are worth knowing."""
+    yield "policy", saved["policy"]["name"], policy.name, "use one policy in both stages"
+    for name, here in _settings(policy).items():
+        # A setting younger than the checkpoint was its default then.
+        yield (
+            f"policy setting {name}",
+            settings.pop(name, here),
+            here,
+            "use one value in both stages",
+        )
+    for name, value in settings.items():
+        yield f"policy setting {name}", value, "unknown", "use the policy it was saved with"
+    view, here = saved["view_shape"], list(env.view_shape)
+    yield "vision", (view[1] - 1) // 2, (here[1] - 1) // 2, "give both stages the same vision"
+    yield (
+        "number of observation channels",
+        view[0],
+        here[0],
+        "use tasks with the same entities (Predator-Prey or Predator-Capture-Prey) in both stages",
+    )
+    yield (
+        "number of actions",
+        saved["num_actions"],
+        env.num_actions,
+        "use tasks with the same actions in both stages",
+    )
+    yield (
+        "the policy's grid",
+        _sides(saved["state_shape"]),
+        _sides(env.state_shape),
+        "upsample the smaller task with StateUpsampled(env, size) to the size of the larger",
+    )
+
+
+def _sides(state_shape: Any) -> str:
+    return f"{state_shape[1]}x{state_shape[2]}"
+
+
+def _describe_task(env: Any) -> dict[str, Any]:
+    fields = dataclasses.fields(env) if dataclasses.is_dataclass(env) else ()
+    return {
+        "class": _class_name(type(env), TASKS),
+        "fields": {field.name: _plain(getattr(env, field.name)) for field in fields if field.init},
+    }
+
+
+def _class_name(cls: type, known: dict[str, Any]) -> str:
+    """Its bare name only if that means this very class, else the name of where it is from."""
+    bare = cls.__name__
+    return bare if known.get(bare) is cls else f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _plain(value: Any) -> Any:
+    """`value` as JSON; what JSON cannot say becomes its repr, which nothing evaluates."""
+    if value is None or isinstance(value, (bool, str)):
+        return value
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value)
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if dataclasses.is_dataclass(value):
+        return _describe_task(value)
+    return repr(value)
+
+
+def _settings(policy: Policy) -> dict[str, Any]:
+    """Every field of the policy's module that a user may set."""
+    variant = POLICIES[policy.name][1] if policy.name in POLICIES else {}
+    fixed = {"team", "parent", "name", *variant}
+    names = [f.name for f in dataclasses.fields(policy.module) if f.init and f.name not in fixed]
+    return {name: _plain(getattr(policy.module, name)) for name in names}
+
+
+def _rebuild_task(task: dict[str, Any], depth: int = 0) -> Environment:
+    name, fields = task["class"], _bounded(task["fields"])
+    if not isinstance(name, str) or name not in TASKS or depth > 4:
+        raise CheckpointError(
+            f"task {name!r} is not one of {', '.join(TASKS)}; build it in your program and take "
+            "the policy's parameters with load_params."
+        )
+    if "env" in fields:
+        fields["env"] = _rebuild_task(fields["env"], depth + 1)
+    env = TASKS[name](**fields)
+    if env.num_agents > MAX_AGENTS or math.prod(env.state_shape) > MAX_CELLS:
+        raise CheckpointError(
+            f"the described task has {env.num_agents} agents on a {_sides(env.state_shape)} grid, "
+            f"more than the {MAX_AGENTS} agents or {MAX_CELLS} cells that are read from a file."
+        )
+    return env
+
+
+def _bounded(fields: dict[str, Any]) -> dict[str, Any]:
+    """Fields read from a file, whole numbers limited (`max_steps` is free), lists hashable."""
+    for name, value in fields.items():
+        if isinstance(value, int) and abs(value) > MAX_SETTING and name != "max_steps":
+            raise CheckpointError(
+                f"{name} {value} is more than the {MAX_SETTING} that is read from a file."
+            )
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
+
+
+# --- Leaves ----------------------------------------------------------------------------------
+
+
+def _named(tree: Any) -> dict[str, Any]:
+    """Leaves by name, as `params/params/core/action/kernel`, in the tree's order."""
+    named = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        parts = [jax.tree_util.keystr((entry,), simple=True) for entry in path]
+        name = "/".join(parts)
+        if not parts or not all(map(_PART.fullmatch, parts)) or name in named:
+            raise CheckpointError(
+                f"a checkpoint cannot name the leaf {name!r}; use unique names of letters, "
+                "digits, _ and - for the parts of the state."
+            )
+        named[name] = leaf
+    return named
+
+
+def _kind(name: str, leaf: Any) -> _Leaf:
+    """Of an array, an abstract one or a Python scalar."""
+    leaf = leaf if hasattr(leaf, "dtype") and hasattr(leaf, "shape") else jnp.asarray(leaf)
+    kind = _Leaf(tuple(leaf.shape), str(leaf.dtype))
+    if kind.dtype not in _DTYPES and kind.dtype not in _KEYS:
+        raise CheckpointError(
+            f"leaf {name} has dtype {kind.dtype}, which a checkpoint cannot hold; keep numbers, "
+            "booleans and PRNG keys in the state."
+        )
+    return kind
+
+
+def _host_arrays(state: Any) -> tuple[dict[str, _Leaf], dict[str, np.ndarray]]:
+    """What each leaf is, and its values as they are stored."""
+    leaves, arrays = {}, {}
+    for name, leaf in _named(state).items():
+        try:
+            leaf = leaf if hasattr(leaf, "dtype") else jnp.asarray(leaf)
+            leaves[name] = _kind(name, leaf)
+            arrays[name] = np.asarray(
+                jax.random.key_data(leaf) if leaves[name].dtype in _KEYS else leaf
+            )
+        except (TypeError, OverflowError, RuntimeError) as error:
+            raise CheckpointError(
+                f"leaf {name} is no array a checkpoint can hold: {_reason(error)}."
+            ) from error
+    if not leaves:
+        raise CheckpointError("the state to save holds no arrays; pass the learner's TrainState.")
+    return leaves, arrays
+
+
+def _nested(named: dict[str, Any]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for name, leaf in named.items():
+        *above, last = name.split("/")
+        node = tree
+        for part in above:
+            node = node.setdefault(part, {})
+        node[last] = leaf
+    return tree
+
+
+def _digest(array: np.ndarray) -> str:
+    return hashlib.sha256(array.tobytes()).hexdigest()
+
+
+def _compare(path: Path, saved: dict[str, _Leaf], wanted: dict[str, _Leaf]) -> None:
+    """Refuses the first leaf that differs."""
+    mend = "use the policy, settings and seeds it was saved with, or train anew"
+    for name in wanted:
+        if name not in saved:
+            raise CheckpointError(
+                f"{path} has no leaf {name}, which is {wanted[name]} in this program; {mend}."
+            )
+    for name, leaf in saved.items():
+        if name not in wanted:
+            raise CheckpointError(
+                f"{path} has a leaf {name}, {leaf}, which this program does not; {mend}."
+            )
+        if leaf != wanted[name]:
+            raise CheckpointError(
+                f"leaf {name} is {leaf} in {path} but {wanted[name]} in this program; {mend}."
+            )
+
+
+# --- Writing ---------------------------------------------------------------------------------
+
+
+def _claim(root: Path) -> Path:
+    """`root` as a directory that is ours to write in, unfinished saves of a killed run removed."""
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        entries = os.listdir(root)
+        if entries and not any(_is_ours(entry) for entry in entries):
+            raise CheckpointError(
+                f"{root} holds other things than checkpoints ({sorted(entries)[0]}); choose a new "
+                "or empty directory."
+            )
+        for entry in entries:
+            if entry.startswith(_SCRATCH):
+                shutil.rmtree(root / entry)
+    except OSError as error:
+        raise CheckpointError(
+            f"checkpoints cannot be written to {root}: {_reason(error)}; choose a directory that "
+            "can be written."
+        ) from error
+    return root.resolve()
+
+
+def _is_ours(entry: str) -> bool:
+    return entry.startswith(_SCRATCH) or _NAME.fullmatch(entry) is not None
+
+
+def _write(
+    root: Path,
+    leaves: dict[str, _Leaf],
+    arrays: dict[str, np.ndarray],
+    meta: dict[str, Any],
+    step: int,
+    keep: int,
+) -> Path:
+    earlier = _checkpoints(root)
+    serial = _serial(earlier[0]) + 1 if earlier else 1
+    scratch, final = root / f"{_SCRATCH}{serial:06d}", root / f"{serial:06d}-step-{step}"
+    try:
+        scratch.mkdir()
+        _orbax_save(scratch / ARRAYS, arrays)
+        _write_description(scratch, leaves, arrays, meta)
+        os.rename(scratch, final)
+        _sync(root)
+    # Orbax and TensorStore report a full disk, a lost mount and the like by many types.
+    except Exception as error:
+        raise CheckpointError(
+            f"the checkpoint {final} could not be written: {_reason(error)}; free space or choose "
+            "another directory (the earlier checkpoints are as they were)."
+        ) from error
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    for old in earlier[keep - 1 :]:
+        _discard(old)
+    return final
+
+
+def _discard(path: Path) -> None:
+    """Out of the way in one rename, so that a kill cannot leave half a checkpoint in its place."""
+    doomed = path.with_name(_SCRATCH + path.name)
+    try:
+        os.rename(path, doomed)
+    except OSError as error:
+        warnings.warn(f"old checkpoint {path} stays: {_reason(error)}.", stacklevel=4)
+    shutil.rmtree(doomed, ignore_errors=True)
+
+
+def _write_description(
+    path: Path, leaves: dict[str, _Leaf], arrays: dict[str, np.ndarray], meta: dict[str, Any]
+) -> None:
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "meta": meta,
+        "leaves": {
+            name: {"shape": leaf.shape, "dtype": leaf.dtype, "sha256": _digest(arrays[name])}
+            for name, leaf in leaves.items()
+        },
+        "files": {},
+    }
+    for name, file in _files(path).items():
+        content["files"][name] = {"bytes": file.stat().st_size, "sha256": _file_digest(file)}
+        _sync(file)
+    # Through JSON once, so that the checksum is of what a reader will see.
+    content = json.loads(json.dumps(content))
+    text = json.dumps({**content, "checksum": _checksum(content)}, indent=1)
+    if len(text) > MAX_DESCRIPTION_BYTES:
+        raise CheckpointError(f"its description is {len(text)} bytes; shorten meta")
+    (path / DESCRIPTION).write_text(text, encoding="utf-8")
+    _sync(path / DESCRIPTION)
+    for folder, _, _ in os.walk(path):
+        _sync(Path(folder))
+
+
+def _checksum(content: dict[str, Any]) -> str:
+    """Of the content, whatever its layout; made the same way in every version of the format."""
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def _sync(path: Path) -> None:
+    """Onto the disk itself, so that a power cut cannot undo what a rename promised."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+# --- Reading ---------------------------------------------------------------------------------
+
+
+def _checkpoints(root: Path) -> list[Path]:
+    """Newest first, by serial number: after going back, a lower step may be the newer one."""
+    try:
+        with os.scandir(root) as entries:
+            found = [
+                root / entry.name
+                for entry in entries
+                if _NAME.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False)
+            ]
+    except OSError:
+        return []
+    return sorted(found, key=_serial, reverse=True)
+
+
+def _serial(path: Path) -> int:
+    return int(path.name.split("-")[0])
+
+
+def _newest_good(root: Path, read: Callable[[Path], T], say: Callable[[str], None] | None) -> T:
+    """`read` of the newest checkpoint that is not damaged."""
+    candidates = [root] if (root / DESCRIPTION).is_file() else _checkpoints(root)
+    if not candidates:
+        what = "holds no checkpoint of sumajax" if root.is_dir() else "is no directory"
+        raise CheckpointError(f"{root} {what}; give a directory that sumajax saved to.")
+    damage: list[str] = []
+    for path in candidates:
+        try:
+            found = read(path)
+        except _DamagedError as error:
+            damage.append(str(error))
+            continue
+        if damage:
+            _tell(f"{damage[0]}; going on from the earlier {path}.", say)
+        return found
+    rest = f" ({len(damage) - 1} earlier ones are damaged too)" if len(damage) > 1 else ""
+    raise CheckpointError(f"{damage[0]}; restore it from a copy or train anew{rest}.")
+
+
+def _tell(sentence: str, say: Callable[[str], None] | None) -> None:
+    if say is None:
+        warnings.warn(sentence, stacklevel=4)
+    else:
+        say(sentence)
+
+
+def _restore(path: Path, like: Any, prefix: str) -> tuple[Any, dict[str, Any]]:
+    """The part of the state whose names start with `prefix`, and meta."""
+    description = _read_description(path)
+    leaves = {k: leaf for k, leaf in description.leaves.items() if k.startswith(prefix)}
+    if not leaves:
+        raise CheckpointError(
+            f"{path} holds no {prefix.rstrip('/')}; give a checkpoint of a training run."
+        )
+    wanted = {} if like is None else _named(like)
+    if like is not None:
+        _compare(path, leaves, {prefix + k: _kind(k, leaf) for k, leaf in wanted.items()})
+    _verify_files(path, description)
+    found = _read_arrays(path, leaves, description.digests)
+    if like is None:
+        return _nested({name.removeprefix(prefix): leaf for name, leaf in found.items()}), (
+            description.meta
+        )
+    ordered = [found[prefix + name] for name in wanted]
+    return jax.tree.unflatten(jax.tree.structure(like), ordered), description.meta
+
+
+def _read_description(path: Path) -> _Description:
+    file = path / DESCRIPTION
+    try:
+        content = json.loads(_read_bounded(file))
+        checksum = content.pop("checksum", None)
+    except (OSError, ValueError, RecursionError, AttributeError) as error:
+        raise _DamagedError(f"{file} is damaged ({_reason(error)})") from error
+    if checksum != _checksum(content):
+        raise _DamagedError(f"{file} is damaged (its checksum does not match its content)")
+    if content.get("format") != FORMAT:
+        raise CheckpointError(f"{file} is not of sumajax; give a directory that sumajax saved to.")
+    version = content.get("version")
+    if version != VERSION:
+        raise CheckpointError(
+            f"{path} is of checkpoint format {version}, newer than the {VERSION} this sumajax "
+            "reads; upgrade sumajax."
+        )
+    try:
+        return _checked(content)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise CheckpointError(
+            f"{file} describes no state that sumajax saves: {_reason(error)}; use another "
+            "checkpoint."
+        ) from error
+
+
+def _read_bounded(file: Path) -> bytes:
+    status = os.lstat(file)
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError("it is not a regular file")
+    if status.st_size > MAX_DESCRIPTION_BYTES:
+        raise ValueError(f"it is larger than {MAX_DESCRIPTION_BYTES} bytes")
+    with open(file, "rb") as opened:
+        return opened.read(MAX_DESCRIPTION_BYTES)
+
+
+def _checked(content: dict[str, Any]) -> _Description:
+    """The description as typed values; anything else in it raises."""
+    leaves = {}
+    for name, leaf in content["leaves"].items():
+        shape, dtype = tuple(leaf["shape"]), leaf["dtype"]
+        if dtype not in _DTYPES and dtype not in _KEYS:
+            raise ValueError(f"leaf {name} has dtype {dtype!r}")
+        if not all(type(side) is int and 0 <= side < 2**48 for side in shape) or len(shape) > 32:
+            raise ValueError(f"leaf {name} has shape {shape}")
+        if not all(map(_PART.fullmatch, name.split("/"))):
+            raise ValueError(f"leaf name {name!r}")
+        leaves[name] = _Leaf(shape, dtype)
+    if sum(leaf.nbytes for leaf in leaves.values()) > MAX_STATE_BYTES:
+        raise ValueError(f"its arrays would need more than {MAX_STATE_BYTES} bytes")
+    if not isinstance(content["meta"], dict):
+        raise TypeError("meta is no dictionary")
+    digests = {name: str(leaf["sha256"]) for name, leaf in content["leaves"].items()}
+    files = {k: (int(v["bytes"]), str(v["sha256"])) for k, v in content["files"].items()}
+    return _Description(content["meta"], leaves, digests, files)
+
+
+def _verify_files(path: Path, description: _Description) -> None:
+    """Refuses a checkpoint in which any file is not the one that was written."""
+    found = _files(path)
+    found.pop(DESCRIPTION, None)
+    for name in sorted(description.files.keys() | found.keys()):
+        if name not in found:
+            raise _DamagedError(f"{path} is damaged (its file {name} is missing)")
+        if name not in description.files:
+            raise _DamagedError(f"{path} is damaged (its file {name} does not belong to it)")
+        status = os.lstat(found[name])
+        if not stat.S_ISREG(status.st_mode):
+            raise _DamagedError(f"{path} is damaged ({name} is not a regular file)")
+        size, digest = description.files[name]
+        if status.st_size != size:
+            raise _DamagedError(
+                f"{path} is damaged (its file {name} has {status.st_size} bytes instead of {size})"
+            )
+        if size > MAX_STATE_BYTES or _file_digest(found[name]) != digest:
+            raise _DamagedError(f"{path} is damaged (the content of its file {name} was altered)")
+
+
+def _files(path: Path) -> dict[str, Path]:
+    """All files below `path`, links not followed, by their names relative to it."""
+    found = {}
+    for folder, folders, names in os.walk(path):
+        links = [name for name in folders if (Path(folder) / name).is_symlink()]
+        for name in [*names, *links]:
+            file = Path(folder) / name
+            found[file.relative_to(path).as_posix()] = file
+    return found
+
+
+def _file_digest(file: Path) -> str:
+    with open(file, "rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def _read_arrays(path: Path, leaves: dict[str, _Leaf], digests: dict[str, str]) -> dict[str, Any]:
+    """Values by name, each the very bytes that were saved."""
+    stored = {name: leaf.stored for name, leaf in leaves.items() if leaf.nbytes}
+    try:
+        arrays = _orbax_load(path / ARRAYS, stored)
+    except _DamagedError:
+        raise
+    # Whatever Orbax and TensorStore make of files that they cannot read.
+    except Exception as error:
+        raise _DamagedError(f"{path / ARRAYS} cannot be read ({_reason(error)})") from error
+    found: dict[str, Any] = {}
+    for name, leaf in leaves.items():
+        shape, dtype = leaf.stored
+        array = np.asarray(arrays[name]) if name in stored else np.zeros(shape, dtype)
+        if (array.shape, array.dtype) != (shape, dtype) or _digest(array) != digests[name]:
+            raise _DamagedError(f"{path} is damaged (leaf {name} is not what was saved)")
+        keys = _KEYS.get(leaf.dtype)
+        found[name] = jax.random.wrap_key_data(jnp.asarray(array), impl=keys[0]) if keys else array
+    return found
+
+
+def _reason(error: BaseException) -> str:
+    """The first line of an error, without a full stop."""
+    text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    lines = text.strip().splitlines() or [type(error).__name__]
+    return lines[0][:200].rstrip(". ")
+
+
+# --- Orbax -----------------------------------------------------------------------------------
+# Imported where it is used: it takes a second, which a program without checkpoints need not wait.
+
+
+def _orbax_save(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    from orbax.checkpoint import v1 as ocp
+
+    # Orbax refuses arrays without elements; their shape and dtype in the description say it all.
+    ocp.save(path, _nested({name: array for name, array in arrays.items() if array.size}))
+
+
+def _orbax_load(
+    path: Path, stored: dict[str, tuple[tuple[int, ...], np.dtype]]
+) -> dict[str, np.ndarray]:
+    """The named arrays; their sizes on disk are compared with `stored` before any is read."""
+    from orbax.checkpoint import v1 as ocp
+
+    if not stored:
+        return {}
+    on_disk = _named(ocp.metadata(path).metadata)
+    for name, (shape, dtype) in stored.items():
+        there = on_disk.get(name)
+        if there is None or (tuple(there.shape), there.dtype) != (shape, dtype):
+            raise _DamagedError(f"{path} is damaged (leaf {name} is not as described)")
+    context = ocp.Context()
+    context.pytree.loading.partial_load = True
+    with context:
+        return _named(ocp.load(path, _nested({name: on_disk[name] for name in stored})))
