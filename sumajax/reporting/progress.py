@@ -18,7 +18,7 @@ from rich.text import Text
 WIDTH = 80
 """Columns of a table in a file, where there is no terminal to ask."""
 ENV_STEPS_PER_EPOCH = 20_000
-MISSING = "–"
+MISSING = "-"
 
 
 @dataclass
@@ -153,16 +153,19 @@ class Progress:
             for state in self.stages.values()
         )
 
-    def fields(self, stage: str) -> dict[str, str]:
-        """What is shown of a stage, as short texts."""
+    def fields(self, stage: str) -> dict[str, Any]:
+        """What is shown of a stage, as short texts; blank where there is nothing to say yet."""
         state = self._stage(stage)
-        metrics = state.metrics or {}
+        fields = {"epochs": f"{state.done}/{state.epochs}"}
+        if state.metrics is None:
+            blank = dict.fromkeys(("speed", "steps_taken", "success", "left"), "")
+            return {**fields, **blank, "speed": "compiling" if state.began else ""}
         return {
-            "epochs": f"{state.done}/{state.epochs}",
+            **fields,
             "speed": _speed(state.env_steps_per_second),
-            "steps_taken": _number(metrics.get("steps_taken"), ".2f"),
-            "success": _number(metrics.get("success"), ".1%"),
-            "left": _duration(self.seconds_left()),
+            "steps_taken": f"steps {_number(state.metrics.get('steps_taken'), '.2f')}",
+            "success": f"success {_number(state.metrics.get('success'), '.1%')}",
+            "left": f"{_duration(self.seconds_left())} left",
         }
 
     def _stage(self, name: str) -> _Stage:
@@ -185,27 +188,24 @@ class _Terminal:
             BarColumn(bar_width=None),
             TextColumn("{task.fields[epochs]}", justify="right"),
             TextColumn("{task.fields[speed]}", justify="right", style="cyan"),
-            TextColumn("steps {task.fields[steps_taken]}", justify="right"),
-            TextColumn("success {task.fields[success]}", justify="right", style="green"),
+            TextColumn("{task.fields[steps_taken]}", justify="right"),
+            TextColumn("{task.fields[success]}", justify="right", style="green"),
             TextColumn("{task.fields[left]}", justify="right", style="magenta"),
             console=Console(file=file, highlight=False),
             expand=True,
         )
         self._tasks: dict[str, TaskID] = {}
         for name, state in progress.stages.items():
-            fields = {**progress.fields(name), "left": ""}
+            fields = progress.fields(name)
             self._tasks[name] = self._bars.add_task(name, total=state.epochs, **fields)
         self._bars.start()
 
     def show(self, name: str, final: bool) -> None:
         fields = self._progress.fields(name)
         if final:
-            fields["left"] = ""
-        state = self._progress.stages[name]
-        description = name if state.metrics is not None else f"{name} (compiling)"
-        self._bars.update(
-            self._tasks[name], description=description, completed=state.done, **fields
-        )
+            fields["left"] = ""  # it is the whole run's, and shown beside the running stage
+        done = self._progress.stages[name].done
+        self._bars.update(self._tasks[name], completed=done, **fields)
 
     def say(self, text: str) -> None:
         self._bars.console.print(text, markup=False)
@@ -226,11 +226,10 @@ class _Lines:
 
     def show(self, name: str, final: bool) -> None:
         now = self._clock()
-        if self._progress.stages[name].metrics is None:
-            self.say(f"{name}: {self._progress.stages[name].epochs} epochs, compiling")
-        elif final or now >= self._next:
+        starts = self._progress.stages[name].metrics is None
+        if starts or final or now >= self._next:
             self.say(_line(name, self._progress.fields(name)))
-            self._next = now + self._interval
+            self._next = now + (0 if starts else self._interval)
 
     def say(self, text: str) -> None:
         print(text, file=self._file, flush=True)
@@ -249,11 +248,7 @@ class _Notebook:
     def show(self, name: str, final: bool) -> None:
         from IPython.display import display
 
-        if self._progress.stages[name].metrics is None:
-            line = f"{name}: compiling"
-        else:
-            line = _line(name, self._progress.fields(name))
-        content = {"text/plain": line}
+        content = {"text/plain": _line(name, self._progress.fields(name))}
         if name in self._handles:
             self._handles[name].update(content, raw=True)
         else:
@@ -305,11 +300,8 @@ def _in_notebook() -> bool:
 
 
 def _line(name: str, fields: Mapping[str, str]) -> str:
-    return (
-        f"{name}: {fields['epochs']} epochs, {fields['speed']}, "
-        f"steps taken {fields['steps_taken']}, success {fields['success']}, "
-        f"{fields['left']} left"
-    )
+    texts = [f"{name}: {fields['epochs']} epochs", *list(fields.values())[1:]]
+    return ", ".join(text for text in texts if text)
 
 
 def _speed(env_steps_per_second: float | None) -> str:
@@ -341,10 +333,16 @@ def _value(value: Any) -> str:
     if isinstance(value, (bool, int, np.integer)):
         return f"{value:,}" if not isinstance(value, bool) else str(value)
     if np.ndim(value) == 0:
-        number = float(value)
-        return f"{number:.4g}" if np.isfinite(number) else MISSING
+        return _short(float(value))
     numbers = [float(item) for item in value if item is not None and np.isfinite(item)]
     if not numbers:
         return MISSING
-    mean = f"{np.mean(numbers):.4g}"
-    return f"{mean} ({min(numbers):.4g}–{max(numbers):.4g})" if len(numbers) > 1 else mean
+    mean = _short(float(np.mean(numbers)))
+    return f"{mean} ({min(numbers):#.3g}-{max(numbers):#.3g})" if len(numbers) > 1 else mean
+
+
+def _short(number: float) -> str:
+    """Four digits, so that a column of like numbers lines up."""
+    if not np.isfinite(number):
+        return MISSING
+    return f"{number:,.0f}" if abs(number) >= 1000 else f"{number:#.4g}"
