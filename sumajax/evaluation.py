@@ -1,0 +1,99 @@
+"""Held-out episodes, sampled and greedy; a random policy and the shortest-path bound beside them."""
+
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from sumajax.environments.types import Environment
+from sumajax.learning.rollout import Actors, act, select, start, state_features
+from sumajax.policies.types import Policy
+
+HELD_OUT_SEED = 20_240_229
+"""Start cells of the held-out episodes; training keys are folded from small seeds, never from this."""
+EPISODES = 1024
+
+
+@struct.dataclass
+class Evaluation:
+    """One row per episode."""
+
+    steps_taken: chex.Array  # (episodes,) int32; the step limit where the team never finished
+    success: chex.Array  # (episodes,) bool
+    episode_return: chex.Array  # (episodes,) float32: undiscounted, mean over agents
+
+
+def held_out_keys(episodes: int = EPISODES) -> chex.PRNGKey:
+    """(episodes,) reset keys of the fixed held-out starts; the same for every policy and seed."""
+    return jax.random.split(jax.random.key(HELD_OUT_SEED), episodes)
+
+
+@partial(jax.jit, static_argnames=("env", "policy", "episodes", "greedy"))
+def evaluate(
+    env: Environment,
+    policy: Policy,
+    params: Any,
+    key: chex.PRNGKey,
+    *,
+    episodes: int = EPISODES,
+    greedy: bool = False,
+) -> Evaluation:
+    """Plays every held-out start once, to its end.
+
+    Args:
+      key: the policy's own randomness; ignored when greedy.
+      greedy: every choice of the policy (action, gate, edge, bit) is its likeliest one.
+    """
+    features = state_features(env, policy, params)
+
+    def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
+        noise = policy.sample_noise(key, (episodes,))
+        noise = jax.tree.map(jnp.zeros_like, noise) if greedy else noise
+        carry, output = act(env, policy, params, features, actors, noise)
+        return carry, output.action
+
+    return _play(env, choose, start(env, policy, held_out_keys(episodes)), key)
+
+
+@partial(jax.jit, static_argnames=("env", "policy", "episodes"))
+def evaluate_random(
+    env: Environment, policy: Policy, key: chex.PRNGKey, *, episodes: int = EPISODES
+) -> Evaluation:
+    """The held-out starts under uniformly random actions, each class over the actions it has."""
+    logits = jnp.where(jnp.asarray(env.action_mask), 0.0, -jnp.inf)
+
+    def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
+        shape = (episodes, env.num_agents)
+        return actors.carry, jax.random.categorical(key, logits, shape=shape).astype(jnp.int32)
+
+    return _play(env, choose, start(env, policy, held_out_keys(episodes)), key)
+
+
+def _play(env: Environment, choose: Any, actors: Actors, key: chex.PRNGKey) -> Evaluation:
+    """Steps all episodes until the last has ended; what ended keeps its figures."""
+    episodes = actors.episode_return.shape[0]
+    result = Evaluation(
+        steps_taken=jnp.zeros(episodes, jnp.int32),
+        success=jnp.zeros(episodes, bool),
+        episode_return=jnp.zeros(episodes),
+    )
+
+    def unfinished(loop: tuple) -> chex.Array:
+        return ~loop[2].all()
+
+    def body(loop: tuple) -> tuple:
+        actors, result, done, time = loop
+        carry, actions = choose(actors, jax.random.fold_in(key, time))
+        env_state, transition = jax.vmap(env.step)(actors.env_state, actions)
+        actors = Actors(env_state, carry, actors.episode_return + transition.reward)
+        now = Evaluation(
+            transition.steps_taken, transition.success, actors.episode_return.mean(-1)
+        )
+        result = select(done, result, now)
+        return actors, result, done | transition.terminated | transition.truncated, time + 1
+
+    loop = (actors, result, jnp.zeros(episodes, bool), jnp.int32(0))
+    return jax.lax.while_loop(unfinished, body, loop)[1]

@@ -1,0 +1,181 @@
+"""The learner's settings and their two presets. Sources of every number: docs/settings.md."""
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
+
+EPOCH_STEPS = 20_000
+"""Environment steps of an epoch: 10 updates of 4 processes x 500 steps (paper VII-C; HetNet's runs)."""
+
+Optimiser = Literal["adam", "rmsprop"]
+Loss = Literal["actor_critic", "hetnet"]
+Preset = Literal["fast", "paper"]
+
+
+@dataclass(frozen=True)
+class LearnerConfig:
+    """How a policy is trained; the defaults are the preset `fast`.
+
+    Attributes:
+      num_envs: environments side by side (E).
+      rollout_length: steps of each environment in an update (T); with `whole_episodes` the least
+        number of steps after which an environment stops at the end of its episode.
+      whole_episodes: start every update afresh and use finished episodes only, as the originals do,
+        instead of going on from where the last segment ended.
+      gamma, gae_lambda: discount and trace decay of the advantage estimates.
+      bootstrap_timeouts: value an episode cut by the step limit as if it went on.
+      team_reward: share of the team's mean in each agent's return, 0 to 1.
+      normalise_advantages: to mean 0, standard deviation 1 over the batch.
+      mask_inactive: no policy gradient for agents whose actions no longer change anything.
+      loss: `actor_critic`, or `hetnet`, the per-class loss of HetNet's published program.
+      value_weight, policy_weight, entropy_weight: of the critic's squared error, of the policy
+        gradient and of the entropy bonus.
+      optimiser, learning_rate: Adam, or RMSprop as the originals set it.
+      max_grad_norm: clip of the gradient's global norm; None is no clipping.
+      clip_per_env: clip each environment's gradient alone before they are added, as processes do.
+      anneal_epochs: learning rate and entropy weight fall linearly to `anneal_to` of their start
+        over this many epochs; 0 keeps them constant.
+      detach_gap: no gradient through the memory past every so many steps of an episode; None: none
+        past the start of the segment.
+
+    Raises:
+      ValueError: for a value out of range or two that do not fit together.
+    """
+
+    num_envs: int = 50
+    rollout_length: int = 20
+    whole_episodes: bool = False
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    bootstrap_timeouts: bool = True
+    team_reward: float = 0.0
+    normalise_advantages: bool = True
+    mask_inactive: bool = True
+    loss: Loss = "actor_critic"
+    value_weight: float = 0.5
+    policy_weight: float = 1.0
+    entropy_weight: float = 0.01
+    optimiser: Optimiser = "adam"
+    learning_rate: float = 1e-3
+    max_grad_norm: float | None = 2.0
+    clip_per_env: bool = False
+    anneal_epochs: int = 0
+    anneal_to: float = 0.02
+    detach_gap: int | None = None
+
+    def __post_init__(self) -> None:
+        _validate(self)
+
+    @property
+    def updates_per_epoch(self) -> int:
+        return EPOCH_STEPS // (self.num_envs * self.rollout_length)
+
+
+_PUBLISHED: dict[str, Any] = {
+    # Singh et al. 2019 and its published program; MAGIC and HetNet build on the same trainer.
+    "num_envs": 4,  # processes of the paper's runs (VII-C)
+    "rollout_length": 500,  # batch_size per process
+    "whole_episodes": True,
+    "gamma": 1.0,
+    "gae_lambda": 1.0,
+    "bootstrap_timeouts": False,
+    "normalise_advantages": False,
+    "mask_inactive": False,
+    "value_weight": 0.01,
+    "entropy_weight": 0.0,
+    "optimiser": "rmsprop",
+    "learning_rate": 1e-3,
+    "max_grad_norm": None,
+    "detach_gap": 10,
+}
+
+_HETNET: dict[str, Any] = {
+    # Seraj et al. 2022: the program's README command (algorithms.md 4.3, 4.6).
+    **_PUBLISHED,
+    "gae_lambda": 0.95,
+    "loss": "hetnet",
+    "value_weight": 1.0,
+    "policy_weight": 50.0,
+    "learning_rate": 1e-4,
+    "max_grad_norm": 0.75,
+    "clip_per_env": True,
+    "detach_gap": 5,
+}
+
+_TEAM = {"team_reward": 1.0}
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "fast": {"commnet": _TEAM, "ic": _TEAM},
+    "paper": {
+        "ic3net": _PUBLISHED,
+        "commnet": {**_PUBLISHED, **_TEAM},
+        "iric": _PUBLISHED,
+        "ic": {**_PUBLISHED, **_TEAM},
+        "magic": {**_PUBLISHED, "value_weight": 0.015},
+        "hetnet": _HETNET,
+        "hetnet-binary": _HETNET,
+    },
+}
+"""Settings that differ from the defaults, by preset and policy."""
+
+
+def preset(name: str, policy: str = "ic3net", **changes: Any) -> LearnerConfig:
+    """The settings of preset `name` for a policy, with `changes`.
+
+    Raises:
+      ValueError: for an unknown preset or setting.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset {name!r} is unknown; choose one of {', '.join(PRESETS)}.")
+    known = {field.name for field in fields(LearnerConfig)}
+    unknown = sorted(set(changes) - known)
+    if unknown:
+        raise ValueError(f"the learner has no setting {unknown[0]!r}; it has {', '.join(known)}.")
+    return LearnerConfig(**{**PRESETS[name].get(policy, {}), **changes})
+
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "gamma": (0.0, 1.0),
+    "gae_lambda": (0.0, 1.0),
+    "team_reward": (0.0, 1.0),
+    "anneal_to": (0.0, 1.0),
+    "value_weight": (0.0, float("inf")),
+    "policy_weight": (0.0, float("inf")),
+    "entropy_weight": (0.0, float("inf")),
+}
+
+
+def _validate(config: LearnerConfig) -> None:
+    for name, least in (("num_envs", 1), ("rollout_length", 1), ("anneal_epochs", 0)):
+        value = getattr(config, name)
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
+    for name, (low, high) in _RANGES.items():
+        if not low <= getattr(config, name) <= high:
+            raise ValueError(
+                f"{name} must lie between {low:g} and {high:g}, got {getattr(config, name)!r}."
+            )
+    for name in ("learning_rate", "max_grad_norm", "detach_gap"):
+        value = getattr(config, name)
+        if value is not None and not 0 < value < float("inf"):
+            raise ValueError(f"{name} must be greater than 0, got {value!r}.")
+    for name, choices in (("optimiser", Optimiser), ("loss", Loss)):
+        if getattr(config, name) not in get_args(choices):
+            raise ValueError(
+                f"{name} {getattr(config, name)!r} is unknown; "
+                f"choose one of {', '.join(get_args(choices))}."
+            )
+    steps = config.num_envs * config.rollout_length
+    if EPOCH_STEPS % steps:
+        raise ValueError(
+            f"{config.num_envs} environments x {config.rollout_length} steps = {steps} steps per "
+            f"update do not divide an epoch of {EPOCH_STEPS}; {_nearest(config)} would."
+        )
+
+
+def _nearest(config: LearnerConfig) -> str:
+    """The two numbers of environments around the given one that divide an epoch."""
+    fits = [n for n in range(1, EPOCH_STEPS + 1) if EPOCH_STEPS % (n * config.rollout_length) == 0]
+    if not fits:
+        return "a rollout_length of 20 with 50 environments"
+    around = sorted(sorted(fits, key=lambda n: abs(n - config.num_envs))[:2])
+    return " or ".join(f"{n} environments" for n in around)

@@ -1,0 +1,234 @@
+"""TrainState, update, epoch: rollout and optimisation as one compiled loop."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from sumajax.environments.types import Environment
+from sumajax.learning.config import LearnerConfig
+from sumajax.learning.losses import LOSSES, LossParts
+from sumajax.learning.optimiser import annealed, make_optimiser
+from sumajax.learning.rollout import Actors, Draws, Trajectory, draw, last_value, rollout, start
+from sumajax.policies.types import Policy
+
+START = -1
+"""Update number folded into the keys of the first episodes, before update 0."""
+
+
+@struct.dataclass
+class TrainState:
+    """Everything training needs to go on; saved and restored as it is."""
+
+    params: Any
+    opt_state: Any
+    actors: Actors  # leaves (E, ...)
+    key: chex.PRNGKey  # (): never changes; each update folds its number in
+    updates: chex.Array  # () int32 updates done
+
+
+@struct.dataclass
+class Tally:
+    """Sums over updates; `summarise` makes `Metrics` of them."""
+
+    env_steps: chex.Array  # () int32
+    episodes: chex.Array  # () int32 episodes that ended, either way
+    steps_taken: chex.Array  # () int32 over those episodes
+    success: chex.Array  # () int32 of those episodes
+    episode_return: chex.Array  # () float32 over those episodes, mean over agents
+    communication: chex.Array  # () float32 over environment steps, mean over agents
+    agent_steps: chex.Array  # () int32
+    loss: LossParts
+    gradient_norm: chex.Array  # () float32 over updates
+    updates: chex.Array  # () int32
+
+
+@struct.dataclass
+class Metrics:
+    """Figures of an epoch. Episode figures are of the episodes that ended in it; NaN if none did."""
+
+    env_steps: chex.Array  # () int32
+    episodes: chex.Array  # () int32
+    steps_taken: chex.Array  # () float32 mean length of an episode
+    success: chex.Array  # () float32 in [0, 1]
+    episode_return: chex.Array  # () float32 undiscounted, mean over agents
+    entropy: chex.Array  # () float32 nats, of the action, per agent that is trained
+    policy_loss: chex.Array  # () float32 per agent that is trained
+    value_loss: chex.Array  # () float32 squared error per agent and step
+    gradient_norm: chex.Array  # () float32 before clipping, mean over updates
+    communication: chex.Array  # () float32 in [0, 1]
+
+
+@dataclass(frozen=True)
+class Learner:
+    """A policy, its task and how it learns; the methods are pure and can be traced and vmapped.
+
+    Attributes:
+      axis: name of the device axis that the environments are spread over, inside `shard_map`;
+        None when one device has them all.
+    """
+
+    env: Environment
+    policy: Policy
+    config: LearnerConfig
+    axis: str | None = None
+
+    def init(self, key: chex.PRNGKey) -> TrainState:
+        """Fresh parameters, optimiser and environments."""
+        params_key, train_key = jax.random.split(key)
+        return self.init_from(self.policy.init(params_key), train_key)
+
+    def init_from(self, params: Any, key: chex.PRNGKey, opt_state: Any = None) -> TrainState:
+        """The start of training from given parameters, and from optimiser memory if given."""
+        fresh = make_optimiser(self.config).init(params)
+        return TrainState(
+            params=params,
+            opt_state=fresh if opt_state is None else opt_state,
+            actors=start(self.env, self.policy, self._keys(key, jnp.int32(START))),
+            key=key,
+            updates=jnp.int32(0),
+        )
+
+    @partial(jax.jit, static_argnums=(0, 2))
+    def train(self, state: TrainState, epochs: int) -> tuple[TrainState, Metrics]:
+        """`epochs` epochs in one compiled call; the metrics' leaves are (epochs,)."""
+        return jax.lax.scan(lambda s, _: self.epoch(s), state, length=epochs)
+
+    def epoch(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        """20,000 environment steps (more with `whole_episodes`, whose last ones run to their end)."""
+        updates = self.config.updates_per_epoch
+        state, tallies = jax.lax.scan(lambda s, _: self.update(s), state, length=updates)
+        return state, summarise(jax.tree.map(lambda x: x.sum(0), tallies))
+
+    def update(self, state: TrainState) -> tuple[TrainState, Tally]:
+        """One rollout and one optimiser step.
+
+        The gradient is that of the loss summed over agents and steps, divided by the number of
+        environment steps (algorithms.md 4.1).
+        """
+        grads, (actors, tally) = self._gradient(state)
+        grads, tally = self._over_devices((grads, tally))
+        grads = jax.tree.map(lambda g: g / tally.env_steps, grads)
+        tally = tally.replace(gradient_norm=optax.global_norm(grads))
+        optimiser = make_optimiser(self.config)
+        step, opt_state = optimiser.update(grads, state.opt_state, state.params)
+        params = optax.apply_updates(state.params, step)
+        next_state = state.replace(
+            params=params, opt_state=opt_state, actors=actors, updates=state.updates + 1
+        )
+        return next_state, tally
+
+    def _gradient(self, state: TrainState) -> tuple[Any, tuple[Actors, Tally]]:
+        config = self.config
+        keys = self._keys(state.key, state.updates)
+        actors, length = state.actors, config.rollout_length
+        if config.whole_episodes:
+            actors = start(self.env, self.policy, jax.vmap(partial(jax.random.fold_in, data=0))(keys))
+            length += self.env.max_steps - 1
+        draws = draw(self.env, self.policy, keys, length)
+        gradient = jax.grad(self._objective, has_aux=True)
+        return gradient(state.params, actors, draws, state.updates)
+
+    def _objective(
+        self, params: Any, actors: Actors, draws: Draws, updates: chex.Array
+    ) -> tuple[chex.Array, tuple[Actors, Tally]]:
+        config = self.config
+        actors, trajectory = rollout(
+            self.env, self.policy, params, actors, draws, config.detach_gap
+        )
+        if config.whole_episodes:
+            valid = until_episode_end(trajectory, config.rollout_length)
+        else:
+            valid = jnp.ones(trajectory.last.shape, bool)
+        loss, parts = LOSSES[config.loss](
+            trajectory,
+            valid,
+            last_value(self.env, self.policy, params, actors),
+            config,
+            annealed(config, updates),
+            self.axis,
+        )
+        return loss, (jax.lax.stop_gradient(actors), tally_of(trajectory, valid, parts))
+
+    def _over_devices(self, sums: Any) -> Any:
+        return sums if self.axis is None else jax.lax.psum(sums, self.axis)
+
+    def _keys(self, key: chex.PRNGKey, update: chex.Array) -> chex.PRNGKey:
+        """(E,) keys of one update; each belongs to an environment, whatever device that is on."""
+        key = jax.random.fold_in(key, update - START)
+        number = jnp.arange(self.config.num_envs)
+        if self.axis is not None:
+            number = number + jax.lax.axis_index(self.axis) * self.config.num_envs
+        return jax.vmap(partial(jax.random.fold_in, key))(number)
+
+
+def until_episode_end(trajectory: Trajectory, least: int) -> chex.Array:
+    """(T, E) bool: the steps up to the first episode end at or after step `least`.
+
+    The originals' collection rule: episodes are never cut, and a process stops at the first end
+    after its share of steps (algorithms.md 4.1).
+    """
+    step = jnp.arange(trajectory.last.shape[0])[:, None]
+    enough = trajectory.last & (step + 1 >= least)
+    return jnp.cumsum(enough, axis=0) - enough == 0
+
+
+def tally_of(trajectory: Trajectory, valid: chex.Array, parts: LossParts) -> Tally:
+    """Counts what `valid` (T, E) steps hold."""
+    ended = trajectory.last & valid
+    num_agents = trajectory.value.shape[-1]
+    return Tally(
+        env_steps=valid.sum(),
+        episodes=ended.sum(),
+        steps_taken=(trajectory.steps_taken * ended).sum(),
+        success=(trajectory.success & ended).sum(),
+        episode_return=(trajectory.episode_return.mean(-1) * ended).sum(),
+        communication=(trajectory.communication.mean(-1) * valid).sum(),
+        agent_steps=valid.sum() * num_agents,
+        loss=jax.lax.stop_gradient(parts),
+        gradient_norm=jnp.float32(0),
+        updates=jnp.int32(1),
+    )
+
+
+def summarise(tally: Tally) -> Metrics:
+    """Means of the sums."""
+    return Metrics(
+        env_steps=tally.env_steps,
+        episodes=tally.episodes,
+        steps_taken=tally.steps_taken / tally.episodes,
+        success=tally.success / tally.episodes,
+        episode_return=tally.episode_return / tally.episodes,
+        entropy=tally.loss.entropy / tally.loss.acting,
+        policy_loss=tally.loss.policy / tally.loss.acting,
+        value_loss=tally.loss.value / tally.agent_steps,
+        gradient_norm=tally.gradient_norm / tally.updates,
+        communication=tally.communication / tally.env_steps,
+    )
+
+
+def make_learner(
+    env: Environment, policy: Policy, config: LearnerConfig | None = None
+) -> Learner:
+    """The learner of `policy` on `env`; `config` defaults to the preset `fast`.
+
+    Raises:
+      ValueError: when the policy was shaped for another task.
+    """
+    spec = type(policy.team).of(env)
+    if policy.team != spec:
+        differ = [
+            f"{name} {getattr(policy.team, name)} against {getattr(spec, name)}"
+            for name in spec.__dataclass_fields__
+            if getattr(policy.team, name) != getattr(spec, name)
+        ]
+        raise ValueError(
+            f"the policy was made for another task: {'; '.join(differ)}; call make_policy with this "
+            "environment (parameters of the same sizes still fit)."
+        )
+    return Learner(env, policy, config or LearnerConfig())

@@ -1,0 +1,125 @@
+"""Actor-critic losses of a trajectory: sums over time, environments and agents.
+
+A loss is a function of (trajectory, valid, last_value, config, entropy_scale, axis) that returns a
+sum to differentiate and `LossParts` to report; `LOSSES` names them.
+"""
+
+from collections.abc import Callable
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from sumajax.learning import returns
+from sumajax.learning.config import LearnerConfig
+from sumajax.learning.rollout import Trajectory
+from sumajax.policies.types import MASKED_LOGIT, Decision
+
+
+@struct.dataclass
+class LossParts:
+    """Sums over a batch, for reporting."""
+
+    policy: chex.Array  # () float32
+    value: chex.Array  # () float32 squared error
+    entropy: chex.Array  # () float32 nats, of the action, where the policy is trained
+    acting: chex.Array  # () float32 number of agent-steps where the policy is trained
+
+
+LossFunction = Callable[
+    [Trajectory, chex.Array, chex.Array, LearnerConfig, chex.Numeric, str | None],
+    tuple[chex.Array, LossParts],
+]
+
+
+def log_prob_and_entropy(decision: Decision) -> tuple[chex.Array, chex.Array]:
+    """(...,) log-probability of what was chosen, and entropy in nats, of one decision."""
+    log_probs = jax.nn.log_softmax(decision.logits)
+    taken = jnp.take_along_axis(log_probs, decision.choice[..., None], axis=-1)[..., 0]
+    possible = decision.logits > MASKED_LOGIT / 2
+    entropy = -jnp.where(possible, jnp.exp(log_probs) * log_probs, 0.0).sum(-1)
+    return taken, entropy
+
+
+def normalise(x: chex.Array, weight: chex.Array, axis: str | None = None) -> chex.Array:
+    """x with mean 0 and standard deviation 1 over the entries of weight 1, of all devices."""
+    sums = jnp.stack([weight.sum(), (weight * x).sum(), (weight * x**2).sum()])
+    count, first, second = sums if axis is None else jax.lax.psum(sums, axis)
+    mean = first / count
+    variance = jnp.maximum(second / count - mean**2, 0.0)
+    return (x - mean) * jax.lax.rsqrt(variance + 1e-8)
+
+
+def policy_gradient(
+    decisions: dict[str, Decision], advantages: chex.Array, weight: chex.Array
+) -> tuple[chex.Array, chex.Array, chex.Array]:
+    """() sum of -weight * advantage * log pi(choices); entropy sums of all decisions, of the action.
+
+    Every decision of an agent (its action, its gate) shares the advantage, which is a constant here.
+    """
+    pairs = {name: log_prob_and_entropy(decision) for name, decision in decisions.items()}
+    log_prob = sum(taken for taken, _ in pairs.values())
+    loss = -(weight * jax.lax.stop_gradient(advantages) * log_prob).sum()
+    entropies = {name: (weight * entropy).sum() for name, (_, entropy) in pairs.items()}
+    return loss, sum(entropies.values(), jnp.float32(0)), entropies["action"]
+
+
+def estimate_advantages(
+    trajectory: Trajectory, last_value: chex.Array, config: LearnerConfig
+) -> chex.Array:
+    """(T, E, N) advantages under `config`, constants to every gradient.
+
+    A step limit is no end of the task: with `bootstrap_timeouts` the value of the observation after
+    it, which the rollout never encodes, is taken to be that of the observation before it.
+    """
+    value, last_value = jax.lax.stop_gradient((trajectory.value, last_value))
+    reward = trajectory.reward
+    if config.bootstrap_timeouts:
+        reward = reward + config.gamma * trajectory.truncated[..., None] * value
+    ongoing = jnp.broadcast_to(~trajectory.last[..., None], value.shape)
+    return returns.generalised_advantages(
+        reward, config.gamma * ongoing, value, last_value, config.gae_lambda
+    )
+
+
+def actor_critic(
+    trajectory: Trajectory,
+    valid: chex.Array,
+    last_value: chex.Array,
+    config: LearnerConfig,
+    entropy_scale: chex.Numeric,
+    axis: str | None = None,
+) -> tuple[chex.Array, LossParts]:
+    """Policy gradient with a learnt baseline.
+
+    sum of -advantage * log pi + value_weight (V - R)^2 - entropy_weight H, with R the advantage plus
+    V, or with `team_reward` partly the team's mean of it.
+
+    Args:
+      valid: (T, E), 0 for steps that must not count.
+      last_value: (E, N) of the observation after the last step.
+      entropy_scale: what annealing leaves of the entropy weight.
+
+    Source: Singh et al. 2019, section 3.2; Mnih et al. 2016 for the entropy.
+    """
+    chex.assert_equal_shape([trajectory.value, trajectory.reward])
+    weight = jnp.broadcast_to(valid[..., None], trajectory.value.shape).astype(jnp.float32)
+    value = jax.lax.stop_gradient(trajectory.value)
+    individual = estimate_advantages(trajectory, last_value, config) + value
+    target = returns.mix_team(individual, config.team_reward)
+    advantages = target - value
+    acting = weight * trajectory.active if config.mask_inactive else weight
+    if config.normalise_advantages:
+        advantages = normalise(advantages, acting, axis)
+    policy, entropy, action_entropy = policy_gradient(trajectory.decisions, advantages, acting)
+    critic = (weight * (trajectory.value - target) ** 2).sum()
+    loss = (
+        config.policy_weight * policy
+        + config.value_weight * critic
+        - config.entropy_weight * entropy_scale * entropy
+    )
+    return loss, LossParts(policy, critic, action_entropy, acting.sum())
+
+
+LOSSES: dict[str, LossFunction] = {"actor_critic": actor_critic}

@@ -1,0 +1,34 @@
+"""The optimisers of the presets."""
+
+import chex
+import jax.numpy as jnp
+import optax
+
+from sumajax.learning.config import LearnerConfig
+
+RMSPROP_DECAY, RMSPROP_EPS = 0.97, 1e-6
+"""The originals' settings (algorithms.md 4.2)."""
+
+
+def annealed(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
+    """What annealing leaves of the learning rate and the entropy weight after so many updates."""
+    if not config.anneal_epochs:
+        return 1.0
+    done = updates / (config.anneal_epochs * config.updates_per_epoch)
+    return jnp.maximum(1.0 - (1.0 - config.anneal_to) * done, config.anneal_to)
+
+
+def make_optimiser(config: LearnerConfig) -> optax.GradientTransformation:
+    """Clipping, then Adam or RMSprop, at the annealed learning rate."""
+    scale = {
+        "adam": optax.scale_by_adam,
+        # v <- .97 v + .03 g^2, p <- p - lr g / (sqrt(v) + eps): optax puts eps inside the root unless
+        # told otherwise, which here would damp a thousand times more.
+        "rmsprop": lambda: optax.scale_by_rms(
+            decay=RMSPROP_DECAY, eps=RMSPROP_EPS, initial_scale=0.0, eps_in_sqrt=False
+        ),
+    }[config.optimiser]()
+    steps = [scale, optax.scale_by_learning_rate(lambda n: config.learning_rate * annealed(config, n))]
+    if config.max_grad_norm is not None and not config.clip_per_env:
+        steps.insert(0, optax.clip_by_global_norm(config.max_grad_norm))
+    return optax.chain(*steps)

@@ -1,0 +1,167 @@
+"""One scan over environment and policy, differentiable with respect to the policy's parameters."""
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from sumajax.environments.types import Environment
+from sumajax.policies.types import Decision, Policy
+
+
+@struct.dataclass
+class Actors:
+    """E environments with the teams that live in them."""
+
+    env_state: Any  # leaves (E, ...)
+    carry: Any  # leaves (E, N, ...): what the agents remember
+    episode_return: chex.Array  # (E, N) float32: undiscounted, of the episode in progress
+
+
+@struct.dataclass
+class Draws:
+    """All the random numbers of a rollout, drawn in one go outside the scan."""
+
+    noise: Any  # leaves (T, E, ...): the policy's
+    fresh: Any  # leaves (T, E, ...): the environment state that follows if an episode ends
+
+
+@struct.dataclass
+class Trajectory:
+    """What T steps of E environments left behind."""
+
+    decisions: dict[str, Decision]  # leaves (T, E, N, ...)
+    value: chex.Array  # (T, E, N) float32
+    communication: chex.Array  # (T, E, N) float32
+    active: chex.Array  # (T, E, N) bool: the action could still change something
+    reward: chex.Array  # (T, E, N) float32
+    terminated: chex.Array  # (T, E) bool
+    truncated: chex.Array  # (T, E) bool
+    success: chex.Array  # (T, E) bool
+    steps_taken: chex.Array  # (T, E) int32
+    episode_return: chex.Array  # (T, E, N) float32: up to and including this step
+
+    @property
+    def last(self) -> chex.Array:
+        """(T, E) bool: the episode ended with this step, either way."""
+        return self.terminated | self.truncated
+
+
+def start(env: Environment, policy: Policy, keys: chex.PRNGKey) -> Actors:
+    """Fresh episodes, one per key of `keys` (E,)."""
+    num_envs = keys.shape[0]
+    return Actors(
+        env_state=jax.vmap(env.reset)(keys),
+        carry=policy.initial_carry((num_envs,)),
+        episode_return=jnp.zeros((num_envs, env.num_agents)),
+    )
+
+
+def draw(env: Environment, policy: Policy, keys: chex.PRNGKey, length: int) -> Draws:
+    """The random numbers of `length` steps; each environment's come from its own key (E,)."""
+
+    def of_one(key: chex.PRNGKey) -> Draws:
+        noise_key, reset_key = jax.random.split(key)
+        return Draws(
+            noise=policy.sample_noise(noise_key, (length,)),
+            fresh=jax.vmap(env.reset)(jax.random.split(reset_key, length)),
+        )
+
+    return jax.vmap(of_one, out_axes=1)(keys)
+
+
+def select(condition: chex.Array, if_true: Any, if_false: Any) -> Any:
+    """Leaf by leaf, along the leading axis of `condition` (E,)."""
+
+    def leaf(a: chex.Array, b: chex.Array) -> chex.Array:
+        return jnp.where(condition.reshape(condition.shape + (1,) * (b.ndim - 1)), a, b)
+
+    return jax.tree.map(leaf, if_true, if_false)
+
+
+def state_features(env: Environment, policy: Policy, params: Any) -> chex.Array | None:
+    """(S, F) features of every state tensor the task has, or None where it has too many to list."""
+    table = env.state_table()
+    return None if table is None else policy.encode_states(params, table)
+
+
+def act(
+    env: Environment,
+    policy: Policy,
+    params: Any,
+    features: chex.Array | None,
+    actors: Actors,
+    noise: Any,
+) -> tuple[Any, Any]:
+    """The policy's step in all environments: (carry, PolicyOutput)."""
+    view = jax.vmap(env.view)(actors.env_state)
+    if features is None:
+        obs = jax.vmap(env.observe)(actors.env_state)
+        flat = obs.state.reshape(-1, *obs.state.shape[-3:])
+        mine = policy.encode_states(params, flat).reshape(*view.shape[:2], -1)
+    else:
+        mine = features[jax.vmap(env.state_index)(actors.env_state)]
+    return policy.step(params, actors.carry, mine, view, noise)
+
+
+def rollout(
+    env: Environment,
+    policy: Policy,
+    params: Any,
+    actors: Actors,
+    draws: Draws,
+    detach_gap: int | None = None,
+) -> tuple[Actors, Trajectory]:
+    """T steps of E environments; ended episodes are followed by `draws.fresh` ones.
+
+    The state tensors are encoded once, before the scan, and gathered by cell. Gradients reach
+    `params` through the trajectory's logits and values, back through the agents' memory and
+    messages to the start of the episode or of the segment, or over `detach_gap` steps.
+    """
+    features = state_features(env, policy, params)
+    beginning = policy.initial_carry((actors.episode_return.shape[0],))
+
+    def body(actors: Actors, draws: Draws) -> tuple[Actors, Trajectory]:
+        active = jax.vmap(env.active)(actors.env_state)
+        carry, output = act(env, policy, params, features, actors, draws.noise)
+        env_state, transition = jax.vmap(env.step)(actors.env_state, output.action)
+        episode_return = actors.episode_return + transition.reward
+        done = transition.terminated | transition.truncated
+        if detach_gap is not None:
+            cut = transition.steps_taken % detach_gap == 0
+            carry = select(cut, jax.lax.stop_gradient(carry), carry)
+        following = Actors(
+            env_state=select(done, draws.fresh, env_state),
+            carry=select(done, beginning, carry),
+            episode_return=select(done, jnp.zeros_like(episode_return), episode_return),
+        )
+        step = Trajectory(
+            decisions=output.decisions,
+            value=output.value,
+            communication=output.communication,
+            active=active,
+            episode_return=episode_return,
+            reward=transition.reward,
+            terminated=transition.terminated,
+            truncated=transition.truncated,
+            success=transition.success,
+            steps_taken=transition.steps_taken,
+        )
+        return following, step
+
+    return jax.lax.scan(body, actors, draws)
+
+
+def last_value(env: Environment, policy: Policy, params: Any, actors: Actors) -> chex.Array:
+    """(E, N) value of what the agents see now: the bootstrap after a rollout. No gradient."""
+    params, actors = jax.lax.stop_gradient((params, actors))
+    num_envs = actors.episode_return.shape[0]
+    # Zero noise: where messages depend on a draw (edges, bits), those of the likeliest draw.
+    noise = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype),
+        jax.eval_shape(lambda: policy.sample_noise(jax.random.key(0), (num_envs,))),
+    )
+    features = state_features(env, policy, params)
+    return act(env, policy, params, features, actors, noise)[1].value
