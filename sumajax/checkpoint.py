@@ -46,8 +46,8 @@ ARRAYS = "state"
 MAX_DESCRIPTION_BYTES = 4 * 2**20
 MAX_STATE_BYTES = 8 * 2**30
 """Of all arrays together, and of all files together, in a checkpoint that will be read."""
-MAX_AGENTS, MAX_CELLS, MAX_SETTING = 10_000, 10_000_000, 100_000
-"""What a task or policy described in a file may ask for before anything is built from it."""
+MAX_SETTING, MAX_CELLS = 10_000, 10_000_000
+"""Whole numbers, and cells of the grid, of a task or policy that is built from a file."""
 
 TASKS: dict[str, type] = {
     cls.__name__: cls for cls in (PredatorPrey, PredatorCapturePrey, StateUpsampled)
@@ -135,16 +135,15 @@ def save(
         that is no array, a `meta` that is no JSON.
     """
     root = Path(directory)
-    step = meta.get("epoch", 0) if step is None else step
-    if isinstance(step, bool) or not isinstance(step, int) or step < 0:
-        raise CheckpointError(f"step must be a whole number of at least 0, got {step!r}.")
-    if isinstance(keep, bool) or not isinstance(keep, int) or keep < 1:
-        raise CheckpointError(f"keep must be a whole number of at least 1, got {keep!r}.")
-    leaves, arrays = _host_arrays(state)
     try:
         json.dumps(meta)
-    except (TypeError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"meta must be plain JSON: {_reason(error)}.") from error
+        step = meta.get("epoch", 0) if step is None else step
+    except (TypeError, ValueError, RecursionError, AttributeError) as error:
+        raise CheckpointError(f"meta must be a dictionary of JSON: {_reason(error)}.") from error
+    for name, value, least in (("step", step, 0), ("keep", keep, 1)):
+        if type(value) is not int or not least <= value < 10**18:
+            raise CheckpointError(f"{name} must be a whole number from {least}, got {value!r}.")
+    leaves, arrays = _host_arrays(state)
     return _write(_claim(root), leaves, arrays, meta, step, keep)
 
 
@@ -207,9 +206,7 @@ def read_meta(
 def latest(directory: str | os.PathLike[str]) -> Path | None:
     """Where the newest checkpoint lies, good or not; None when there is none to go on from."""
     root = Path(directory)
-    if (root / DESCRIPTION).is_file():
-        return root
-    return next(iter(_checkpoints(root)), None)
+    return next(iter(_candidates(root)), None)
 
 
 # --- Tasks and policies in words -------------------------------------------------------------
@@ -254,12 +251,17 @@ def rebuild(meta: dict[str, Any]) -> tuple[Environment, Policy]:
                 f"policy {name!r} is not one of {', '.join(POLICIES)}; build it in your program "
                 "and take its parameters with load_params."
             )
-        return env, make_policy(name, env, **_bounded(settings))
+        policy = make_policy(name, env, **_bounded(settings))
+        defaults = {field.name: field.default for field in dataclasses.fields(policy.module)}
+        for setting, value in settings.items():
+            if type(value) is not type(defaults[setting]) and defaults[setting] is not None:
+                raise ValueError(f"policy setting {setting} is {value!r}")
+        return env, policy
     except CheckpointError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise CheckpointError(
-            f"the checkpoint's description of task and policy is not usable: {_reason(error)}; "
+            f"the checkpoint's description of task and policy is not usable ({_reason(error)}); "
             "save it with meta from describe(env, policy)."
         ) from error
 
@@ -344,14 +346,14 @@ def _describe_task(env: Any) -> dict[str, Any]:
     }
 
 
-def _class_name(cls: type, known: dict[str, Any]) -> str:
+def _class_name(cls: Any, known: dict[str, Any]) -> str:
     """Its bare name only if that means this very class, else the name of where it is from."""
     bare = cls.__name__
     return bare if known.get(bare) is cls else f"{cls.__module__}.{cls.__qualname__}"
 
 
 def _plain(value: Any) -> Any:
-    """`value` as JSON; what JSON cannot say becomes its repr, which nothing evaluates."""
+    """`value` as JSON; of what JSON cannot say only the name is kept."""
     if value is None or isinstance(value, (bool, str)):
         return value
     if isinstance(value, (int, np.integer)):
@@ -360,9 +362,9 @@ def _plain(value: Any) -> Any:
         return float(value)
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
-    if dataclasses.is_dataclass(value):
+    if type(value) in TASKS.values():
         return _describe_task(value)
-    return repr(value)
+    return _class_name(value if hasattr(value, "__qualname__") else type(value), {})
 
 
 def _settings(policy: Policy) -> dict[str, Any]:
@@ -383,10 +385,10 @@ def _rebuild_task(task: dict[str, Any], depth: int = 0) -> Environment:
     if "env" in fields:
         fields["env"] = _rebuild_task(fields["env"], depth + 1)
     env = TASKS[name](**fields)
-    if env.num_agents > MAX_AGENTS or math.prod(env.state_shape) > MAX_CELLS:
+    if math.prod(env.state_shape) > MAX_CELLS:
         raise CheckpointError(
-            f"the described task has {env.num_agents} agents on a {_sides(env.state_shape)} grid, "
-            f"more than the {MAX_AGENTS} agents or {MAX_CELLS} cells that are read from a file."
+            f"the described task has a {_sides(env.state_shape)} grid, more than the {MAX_CELLS} "
+            "cells that are read from a file; build it in your program."
         )
     return env
 
@@ -396,7 +398,8 @@ def _bounded(fields: dict[str, Any]) -> dict[str, Any]:
     for name, value in fields.items():
         if isinstance(value, int) and abs(value) > MAX_SETTING and name != "max_steps":
             raise CheckpointError(
-                f"{name} {value} is more than the {MAX_SETTING} that is read from a file."
+                f"the described {name} {value} is more than the {MAX_SETTING} that is read from a "
+                "file; build task and policy in your program."
             )
     return {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
 
@@ -414,7 +417,11 @@ def _version(package: str) -> str:
 def _named(tree: Any) -> dict[str, Any]:
     """Leaves by name, as `params/params/core/action/kernel`, in the tree's order."""
     named = {}
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+    try:
+        leaves = jax.tree_util.tree_leaves_with_path(tree)
+    except ValueError as error:
+        raise CheckpointError(f"the state is no tree of named leaves: {_reason(error)}.") from error
+    for path, leaf in leaves:
         parts = [jax.tree_util.keystr((entry,), simple=True) for entry in path]
         name = "/".join(parts)
         if not parts or not all(map(_PART.fullmatch, parts)) or name in named:
@@ -577,6 +584,7 @@ def _write_description(
         _sync(file)
     # Through JSON once, so that the checksum is of what a reader will see.
     content = json.loads(json.dumps(content))
+    _checked(content)  # nothing is written that the reader would refuse
     text = json.dumps({**content, "checksum": _checksum(content)}, indent=1)
     if len(text) > MAX_DESCRIPTION_BYTES:
         raise CheckpointError(f"its description is {len(text)} bytes; shorten meta")
@@ -618,15 +626,21 @@ def _checkpoints(root: Path) -> list[Path]:
     return sorted(found, key=_serial, reverse=True)
 
 
+def _candidates(directory: Path) -> list[Path]:
+    """Newest first: the checkpoints in `directory`, or itself if it is one."""
+    is_one = os.path.isfile(directory / DESCRIPTION)
+    return [directory] if is_one else _checkpoints(directory)
+
+
 def _serial(path: Path) -> int:
     return int(path.name.split("-")[0])
 
 
 def _newest_good(root: Path, read: Callable[[Path], T], say: Callable[[str], None] | None) -> T:
     """`read` of the newest checkpoint that is not damaged."""
-    candidates = [root] if (root / DESCRIPTION).is_file() else _checkpoints(root)
+    candidates = _candidates(root)
     if not candidates:
-        what = "holds no checkpoint of sumajax" if root.is_dir() else "is no directory"
+        what = "holds no checkpoint of sumajax" if os.path.isdir(root) else "is no directory"
         raise CheckpointError(f"{root} {what}; give a directory that sumajax saved to.")
     damage: list[str] = []
     for path in candidates:
@@ -634,6 +648,9 @@ def _newest_good(root: Path, read: Callable[[Path], T], say: Callable[[str], Non
             found = read(path)
         except _DamagedError as error:
             damage.append(str(error))
+            continue
+        except OSError as error:
+            damage.append(f"{path} cannot be read ({_reason(error)})")
             continue
         if damage:
             _tell(f"{damage[0]}; going on from the earlier {path}.", say)
@@ -674,18 +691,20 @@ def _read_description(path: Path) -> _Description:
     file = path / DESCRIPTION
     try:
         content = json.loads(_read_bounded(file))
-        checksum = content.pop("checksum", None)
-    except (OSError, ValueError, RecursionError, AttributeError) as error:
+        is_intact = content.pop("checksum") == _checksum(content)
+    except FileNotFoundError as error:
+        raise _DamagedError(f"{path} is damaged (its file {DESCRIPTION} is missing)") from error
+    except (OSError, ValueError, RecursionError, AttributeError, KeyError, TypeError) as error:
         raise _DamagedError(f"{file} is damaged ({_reason(error)})") from error
-    if checksum != _checksum(content):
+    if not is_intact:
         raise _DamagedError(f"{file} is damaged (its checksum does not match its content)")
     if content.get("format") != FORMAT:
         raise CheckpointError(f"{file} is not of sumajax; give a directory that sumajax saved to.")
     version = content.get("version")
     if version != VERSION:
         raise CheckpointError(
-            f"{path} is of checkpoint format {version}, newer than the {VERSION} this sumajax "
-            "reads; upgrade sumajax."
+            f"{path} is of checkpoint format {version} and this sumajax reads {VERSION}; use the "
+            "sumajax it was saved with, or a newer one."
         )
     try:
         return _checked(content)
@@ -723,7 +742,14 @@ def _checked(content: dict[str, Any]) -> _Description:
     if not isinstance(content["meta"], dict):
         raise TypeError("meta is no dictionary")
     digests = {name: str(leaf["sha256"]) for name, leaf in content["leaves"].items()}
-    files = {k: (int(v["bytes"]), str(v["sha256"])) for k, v in content["files"].items()}
+    files = {k: (v["bytes"], str(v["sha256"])) for k, v in content["files"].items()}
+    for name, (size, _) in files.items():
+        # Orbax keeps values in folders called d; the rest it reads whole, as JSON and the like.
+        limit = MAX_STATE_BYTES if "/d/" in name else MAX_DESCRIPTION_BYTES
+        if type(size) is not int or not 0 <= size <= limit:
+            raise ValueError(f"file {name} has {size} bytes")
+    if sum(size for size, _ in files.values()) > MAX_STATE_BYTES:
+        raise ValueError(f"its files have more than {MAX_STATE_BYTES} bytes")
     return _Description(content["meta"], leaves, digests, files)
 
 
@@ -744,7 +770,7 @@ def _verify_files(path: Path, description: _Description) -> None:
             raise _DamagedError(
                 f"{path} is damaged (its file {name} has {status.st_size} bytes instead of {size})"
             )
-        if size > MAX_STATE_BYTES or _file_digest(found[name]) != digest:
+        if _file_digest(found[name]) != digest:
             raise _DamagedError(f"{path} is damaged (the content of its file {name} was altered)")
 
 
@@ -811,7 +837,7 @@ def _orbax_load(
 
     if not stored:
         return {}
-    on_disk = _named(ocp.metadata(path).metadata)
+    on_disk = _named(ocp.metadata(path.absolute()).metadata)
     for name, (shape, dtype) in stored.items():
         there = on_disk.get(name)
         if there is None or (tuple(there.shape), there.dtype) != (shape, dtype):
@@ -819,4 +845,4 @@ def _orbax_load(
     context = ocp.Context()
     context.pytree.loading.partial_load = True
     with context:
-        return _named(ocp.load(path, _nested({name: on_disk[name] for name in stored})))
+        return _named(ocp.load(path.absolute(), _nested({name: on_disk[name] for name in stored})))
