@@ -14,12 +14,22 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Patch, Rectangle
+from matplotlib.patches import (
+    Circle,
+    FancyArrowPatch,
+    FancyBboxPatch,
+    Patch,
+    Polygon,
+    Rectangle,
+)
+from matplotlib.text import Text
 from PIL import Image
 
-from sumajax.environments.grid import CAPTURE, DOWN, LEFT, RIGHT, UP
+from sumajax.environments.grid import DOWN, LEFT, RIGHT, UP, window_offsets
 from sumajax.environments.types import Environment
 from sumajax.policies.types import Policy
 from sumajax.reporting.metrics import write_bytes
@@ -33,6 +43,8 @@ INK, FAINT = "#333333", "#BBBBBB"
 
 STRIP_INCHES = 9.0
 DPI = 100
+RING = 1.18
+"""Radius of the ring around an agent that talks, in radii of the agent."""
 MIN_WEIGHT = 1e-3
 """Attention below this is not drawn: nothing worth seeing was said."""
 STEPS = {UP: (-1, 0), RIGHT: (0, 1), DOWN: (1, 0), LEFT: (0, -1)}
@@ -245,18 +257,33 @@ def strip_figure(episode: Episode, moments: Sequence[int]) -> Figure:
 def draw_frame(axes: Axes, episode: Episode, moment: int) -> None:
     """Draws frame `moment` in 0..T into `axes`; lengths are in cells, so it scales with them."""
     _draw_grid(axes, episode.size)
-    _draw_sight(axes, episode, moment)
+    for artist in frame_artists(episode, moment, _cell_points(axes)):
+        axes.add_artist(artist)
+
+
+def frame_artists(episode: Episode, moment: int, cell_points: float) -> list[Artist]:
+    """What a frame shows beside the grid, in the order it is drawn.
+
+    Args:
+      cell_points: side of a cell in points, for the size of the numbers.
+    """
     places, radius = spots(episode.agents[moment])
     # Whoever stands on the prey stands in front of it: its tips still show.
     occupied = (episode.agents[moment] == episode.prey).all(-1).any()
-    _draw_prey(axes, episode.prey, 0.5 if occupied else 0.32)
+    artists = [
+        *_sight(episode, moment),
+        *_prey(episode.prey, 0.5 if occupied else 0.32),
+        _title(episode, moment),
+    ]
     if moment < episode.num_steps:
-        _draw_talk(axes, episode, moment, places, radius)
+        artists += [
+            *_messages(episode, moment, places, radius),
+            *_moves(episode, moment, places, radius),
+        ]
+        artists += _gates(episode.communication[moment], places, radius)
     for agent in range(episode.num_agents):
-        _draw_agent(axes, episode, moment, agent, places[agent], radius[agent])
-    done = moment == episode.num_steps and episode.success
-    style = {"color": DONE_COLOUR, "fontweight": "bold"} if done else {"color": INK}
-    axes.set_title(caption(episode, moment), fontsize=9, pad=3, **style)
+        artists += _agent(episode, moment, agent, places[agent], float(radius[agent]), cell_points)
+    return sorted(artists, key=Artist.get_zorder)
 
 
 def caption(episode: Episode, moment: int) -> str:
@@ -289,7 +316,7 @@ def spots(agents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         radius = 0.46 * sine / (1 + sine)
         angle = -3 * np.pi / 4 + 2 * np.pi * np.arange(len(here)) / len(here)
         centres[here] += (0.46 - radius) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        radii[here] = 0.92 * radius
+        radii[here] = 0.85 * radius  # room for the rings of those who talk
     return centres, radii
 
 
@@ -315,10 +342,16 @@ def _frames(episode: Episode, figure: Figure) -> Iterator[np.ndarray]:
     width, height = figure.get_size_inches()
     axes = figure.add_axes((0.1 / width, 0.62 / height, 1 - 0.2 / width, 1 - 0.92 / height))
     _add_legend(figure, episode, across=4)
+    _draw_grid(axes, episode.size)
+    canvas.draw()
+    # What never changes is drawn once; on a slow core this saves two thirds of the time.
+    background = canvas.copy_from_bbox(figure.bbox)
     for moment in range(episode.num_steps + 1):
-        axes.clear()
-        draw_frame(axes, episode, moment)
-        canvas.draw()
+        canvas.restore_region(background)
+        for artist in frame_artists(episode, moment, _cell_points(axes)):
+            axes.add_artist(artist)
+            axes.draw_artist(artist)
+            artist.remove()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
@@ -327,7 +360,11 @@ def _palette(images: Sequence[Image.Image]) -> Image.Image:
     sheet = Image.new("RGB", (images[0].width, images[0].height * len(images)))
     for index, image in enumerate(images):
         sheet.paste(image, (0, index * image.height))
-    return sheet.quantize(255, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    palette = sheet.quantize(255, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    colours = np.array(palette.getpalette(), np.uint8).reshape(-1, 3)
+    colours[colours.astype(int).sum(-1).argmax()] = 255  # the cut averages white with its shades
+    palette.putpalette(colours.ravel().tolist())
+    return palette
 
 
 def _draw_grid(axes: Axes, size: tuple[int, int]) -> None:
@@ -335,50 +372,70 @@ def _draw_grid(axes: Axes, size: tuple[int, int]) -> None:
     axes.set_xlim(-0.5, columns - 0.5)
     axes.set_ylim(rows - 0.5, -0.5)  # row 0 at the top
     axes.set_aspect("equal")
-    axes.set_xticks(np.arange(columns + 1) - 0.5, [])
-    axes.set_yticks(np.arange(rows + 1) - 0.5, [])
-    axes.grid(True, color="#E0E0E0", linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(length=0)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    across = [[(-0.5, row - 0.5), (columns - 0.5, row - 0.5)] for row in range(1, rows)]
+    along = [[(column - 0.5, -0.5), (column - 0.5, rows - 0.5)] for column in range(1, columns)]
+    axes.add_artist(LineCollection(across + along, colors="#E0E0E0", linewidths=0.7, zorder=0.4))
     for spine in axes.spines.values():
         spine.set_color(FAINT)
 
 
-def _draw_sight(axes: Axes, episode: Episode, moment: int) -> None:
-    for agent in range(episode.num_agents):
-        sight = episode.sight(agent)
-        if sight is None:
-            continue
-        row, column = episode.agents[moment, agent]
-        colour = AGENT_COLOURS[episode.agent_class[agent]]
-        corner = (column - sight - 0.5, row - sight - 0.5)
-        side = 2 * sight + 1
-        axes.add_patch(
-            Rectangle(corner, side, side, facecolor=colour, alpha=0.1, linewidth=0, zorder=0.5)
-        )
-
-
-def _draw_prey(axes: Axes, prey: np.ndarray, radius: float) -> None:
-    row, column = prey
-    axes.add_patch(
-        Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=PREY_COLOUR, alpha=0.45, linewidth=0)
+def _title(episode: Episode, moment: int) -> Artist:
+    rows, columns = episode.size
+    done = moment == episode.num_steps and episode.success
+    return Text(
+        (columns - 1) / 2,
+        -0.5 - 0.012 * rows,
+        caption(episode, moment),
+        color=DONE_COLOUR if done else INK,
+        fontweight="bold" if done else "normal",
+        fontsize=9,
+        ha="center",
+        va="bottom",
+        clip_on=False,
+        zorder=9,
     )
+
+
+def _sight(episode: Episode, moment: int) -> Iterator[Artist]:
+    """A shade over all cells that somebody of a class sees, darker where several do."""
+    for kind, colour in enumerate(AGENT_COLOURS):
+        cells, seers = np.unique(seen_cells(episode, moment, kind), axis=0, return_counts=True)
+        if len(cells):
+            centre = cells[:, None, ::-1]
+            corners = centre + np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+            alphas = np.where(seers > 1, 0.2, 0.11)
+            colours = [to_rgba(colour, alpha) for alpha in alphas]
+            yield PolyCollection(
+                corners, facecolors=colours, linewidths=0, antialiased=False, zorder=0.5
+            )
+
+
+def seen_cells(episode: Episode, moment: int, kind: int) -> np.ndarray:
+    """(M, 2) cells inside the grid that agents of a class see, one for each agent that does."""
+    cells = [
+        grid_cell + window_offsets(sight).reshape(-1, 2)
+        for agent, grid_cell in enumerate(episode.agents[moment])
+        if episode.agent_class[agent] == kind and (sight := episode.sight(agent)) is not None
+    ]
+    seen = np.concatenate([np.zeros((0, 2), int), *cells])
+    return seen[((seen >= 0) & (seen < episode.size)).all(-1)]
+
+
+def _prey(prey: np.ndarray, radius: float) -> Iterator[Artist]:
+    row, column = prey
+    yield Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor="#F8F3B0", linewidth=0, zorder=1)
     tips = np.arange(10) * np.pi / 5 - np.pi / 2
     reach = np.where(np.arange(10) % 2 == 0, radius, 0.45 * radius)
-    axes.fill(
-        column + reach * np.cos(tips),
-        row + reach * np.sin(tips),
-        facecolor=PREY_COLOUR,
-        edgecolor=INK,
-        linewidth=0.8,
-        zorder=3,
-    )
+    corners = np.stack([column + reach * np.cos(tips), row + reach * np.sin(tips)], axis=-1)
+    yield Polygon(corners, facecolor=PREY_COLOUR, edgecolor=INK, linewidth=0.8, zorder=3)
 
 
-def _draw_talk(
-    axes: Axes, episode: Episode, moment: int, places: np.ndarray, radius: np.ndarray
-) -> None:
-    """Arrows from senders to receivers, as strong as the attention, and rings around open gates."""
+def _messages(
+    episode: Episode, moment: int, places: np.ndarray, radius: np.ndarray
+) -> Iterator[Artist]:
+    """Arrows from senders to receivers, as strong as the attention."""
     strongest = max(float(np.max(episode.attention, initial=0)), MIN_WEIGHT)
     weights = {(sender, receiver): w for sender, receiver, w in messages(episode, moment)}
     faint = min(1.0, (12 / max(len(weights), 1)) ** 0.5)  # a crowd of arrows must not hide the team
@@ -391,6 +448,7 @@ def _draw_talk(
         arrow = FancyArrowPatch(
             tuple(start),
             tuple(end),
+            # Unequal answers get a bent line each, equal ones share a straight line.
             connectionstyle="arc3,rad=0" if same else "arc3,rad=0.15",
             arrowstyle="<|-|>" if same else "-|>",
             mutation_scale=5 + 3 * faint,
@@ -402,25 +460,40 @@ def _draw_talk(
             zorder=4,
         )
         arrow.set_gid(f"message {sender} {receiver}")
-        axes.add_patch(arrow)
-    for agent, share in enumerate(episode.communication[moment]):
+        yield arrow
+
+
+def _gates(shares: np.ndarray, places: np.ndarray, radius: np.ndarray) -> Iterator[Artist]:
+    """A ring around every agent that talks; the fainter, the less of its means it uses."""
+    for agent, share in enumerate(shares):
         if share > MIN_WEIGHT:
-            _draw_gate(axes, places[agent], float(radius[agent]), min(float(share), 1.0))
+            ring = Circle(
+                (places[agent, 0], places[agent, 1]),
+                RING * float(radius[agent]),
+                fill=False,
+                edgecolor=TALK_COLOUR,
+                alpha=0.3 + 0.7 * min(float(share), 1.0),
+                linewidth=1.4,
+                zorder=5,
+            )
+            ring.set_gid(f"gate {agent}")
+            yield ring
 
 
-def _draw_gate(axes: Axes, place: np.ndarray, radius: float, share: float) -> None:
-    """A ring around an agent that talks; the fainter, the less of its means it uses."""
-    ring = Circle(
-        (place[0], place[1]),
-        1.2 * radius,
-        fill=False,
-        edgecolor=TALK_COLOUR,
-        alpha=0.3 + 0.7 * share,
-        linewidth=1.4,
-        zorder=5,
-    )
-    ring.set_gid("gate")
-    axes.add_patch(ring)
+def _moves(
+    episode: Episode, moment: int, places: np.ndarray, radius: np.ndarray
+) -> Iterator[Artist]:
+    """A small nose on the side every agent is about to move to."""
+    for agent, action in enumerate(episode.actions[moment]):
+        if int(action) not in STEPS or episode.reached[moment, agent]:
+            continue
+        down, right = STEPS[int(action)]
+        ahead = radius[agent] * np.array([right, down])
+        across = 0.4 * radius[agent] * np.array([down, right])
+        foot = places[agent] + 1.25 * ahead
+        corners = np.stack([places[agent] + 1.65 * ahead, foot + across, foot - across])
+        colour = AGENT_COLOURS[episode.agent_class[agent]]
+        yield Polygon(corners, facecolor=colour, linewidth=0, zorder=6)
 
 
 def _between(
@@ -433,62 +506,49 @@ def _between(
     return places[sender] + way * gaps[0] / length, places[receiver] - way * gaps[1] / length
 
 
-def _draw_agent(
-    axes: Axes, episode: Episode, moment: int, agent: int, place: np.ndarray, radius: float
-) -> None:
-    x, y = place
+def _agent(
+    episode: Episode, moment: int, agent: int, place: np.ndarray, radius: float, cell_points: float
+) -> Iterator[Artist]:
+    """An agent with its number, as far as that is legible, and what it has captured."""
+    x, y = float(place[0]), float(place[1])
     kind = int(episode.agent_class[agent])
-    style: dict[str, Any] = {
-        "facecolor": AGENT_COLOURS[kind],
-        "edgecolor": "white",
-        "linewidth": 0.8,
-        "zorder": 6,
-    }
+    style: dict[str, Any] = {"facecolor": AGENT_COLOURS[kind], "edgecolor": "white"}
     if kind == PREDATOR:
-        axes.add_patch(Circle((x, y), radius, **style))
+        yield Circle((x, y), radius, linewidth=0.8, zorder=6, **style)
     else:
         half = 0.8 * radius
         box = f"round,pad=0,rounding_size={0.3 * half}"
-        axes.add_patch(FancyBboxPatch((x - half, y - half), 2 * half, 2 * half, box, **style))
-    if moment < episode.num_steps and not episode.reached[moment, agent]:
-        _draw_action(axes, int(episode.actions[moment, agent]), x, y, radius, AGENT_COLOURS[kind])
-    pixels = radius * _cell_points(axes)
-    if pixels >= 3.5:
-        axes.text(
-            x, y, str(agent), color="white", fontsize=min(1.15 * pixels, 12), fontweight="bold",
-            ha="center", va="center_baseline", zorder=7,
-        )  # fmt: skip
-    captures = moment < episode.num_steps and episode.actions[moment, agent] == CAPTURE
+        corner = (x - half, y - half)
+        yield FancyBboxPatch(corner, 2 * half, 2 * half, box, linewidth=0.8, zorder=6, **style)
+    points = radius * cell_points
+    if points >= 3.5:
+        yield Text(
+            x,
+            y,
+            str(agent),
+            color="white",
+            fontsize=min((1.3 if agent < 10 else 1.0) * points, 12),
+            fontweight="bold",
+            ha="center",
+            va="center_baseline",
+            zorder=7,
+        )
     if kind == CAPTURER and episode.captured[moment, agent]:
-        _draw_badge(axes, x, y, radius)
-    elif kind == CAPTURER and captures and (episode.agents[moment, agent] == episode.prey).all():
-        axes.plot(x, y, marker="+", color=DONE_COLOUR, markersize=2.6 * pixels, zorder=5.5)
+        yield from _badge(agent, x + 0.8 * radius, y - 0.8 * radius, 0.55 * radius)
 
 
-def _draw_badge(axes: Axes, x: float, y: float, radius: float) -> None:
-    """A tick at the upper right of an agent that has captured the prey."""
-    x, y, size = x + 0.8 * radius, y - 0.8 * radius, 0.55 * radius
-    badge = Circle((x, y), size, facecolor=DONE_COLOUR, edgecolor="white", linewidth=0.6, zorder=8)
-    badge.set_gid("captured")
-    axes.add_patch(badge)
+def _badge(agent: int, x: float, y: float, size: float) -> Iterator[Artist]:
+    """A tick for an agent that has captured the prey."""
+    disc = Circle((x, y), size, facecolor=DONE_COLOUR, edgecolor="white", linewidth=0.6, zorder=8)
+    disc.set_gid(f"captured {agent}")
+    yield disc
     tick = np.array([(-0.5, 0.0), (-0.12, 0.4), (0.5, -0.4)]) * size
-    axes.plot(x + tick[:, 0], y + tick[:, 1], color="white", linewidth=1.0, zorder=9)
-
-
-def _draw_action(axes: Axes, action: int, x: float, y: float, radius: float, colour: str) -> None:
-    """A small nose on the side an agent is about to move to."""
-    if action not in STEPS:
-        return
-    down, right = STEPS[action]
-    tip = np.array([x + 1.65 * radius * right, y + 1.65 * radius * down])
-    foot = np.array([x + 1.25 * radius * right, y + 1.25 * radius * down])
-    across = 0.4 * radius * np.array([down, right])
-    corners = np.stack([tip, foot + across, foot - across])
-    axes.fill(corners[:, 0], corners[:, 1], facecolor=colour, linewidth=0, zorder=6)
+    yield Line2D(x + tick[:, 0], y + tick[:, 1], color="white", linewidth=1.0, zorder=9)
 
 
 def _cell_points(axes: Axes) -> float:
-    """The side of a cell in points."""
+    """The side of a cell in points, once the grid's proportions are set."""
+    axes.apply_aspect()
     origin, one = axes.transData.transform([(0.0, 0.0), (1.0, 0.0)])
     figure = axes.get_figure(root=True)
     return abs(float(one[0] - origin[0])) * 72 / (figure.dpi if figure is not None else DPI)
