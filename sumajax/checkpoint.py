@@ -13,10 +13,12 @@ anything is trained on. Reading executes nothing from the directory, unpickles n
 bounded. One program at a time may write to a directory; any number may read.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
 import json
+import logging
 import math
 import os
 import re
@@ -812,8 +814,10 @@ def _read_arrays(path: Path, leaves: dict[str, _Leaf], digests: dict[str, str]) 
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of an error, without a full stop."""
+    """The first line of an error, or what the system said at its root, without a full stop."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    if said := re.search(r"([^:]+) \[os_error_code=", text):  # of TensorStore
+        return said[1].strip()
     lines = text.strip().splitlines() or [type(error).__name__]
     return lines[0][:200].rstrip(". ")
 
@@ -822,27 +826,41 @@ def _reason(error: BaseException) -> str:
 # Imported where it is used: it takes a second, which a program without checkpoints need not wait.
 
 
-def _orbax_save(path: Path, arrays: dict[str, np.ndarray]) -> None:
+@contextlib.contextmanager
+def _orbax() -> Iterator[Any]:
+    """Orbax's v1 interface, without the tracebacks it logs of errors that it also raises."""
     from orbax.checkpoint import v1 as ocp
 
+    log = logging.getLogger("absl")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        yield ocp
+    finally:
+        log.setLevel(level)
+
+
+def _orbax_save(path: Path, arrays: dict[str, np.ndarray]) -> None:
     # Orbax refuses arrays without elements; their shape and dtype in the description say it all.
-    ocp.save(path, _nested({name: array for name, array in arrays.items() if array.size}))
+    stored = _nested({name: array for name, array in arrays.items() if array.size})
+    with _orbax() as ocp:
+        ocp.save(path, stored)
 
 
 def _orbax_load(
     path: Path, stored: dict[str, tuple[tuple[int, ...], np.dtype]]
 ) -> dict[str, np.ndarray]:
     """The named arrays; their sizes on disk are compared with `stored` before any is read."""
-    from orbax.checkpoint import v1 as ocp
-
     if not stored:
         return {}
-    on_disk = _named(ocp.metadata(path.absolute()).metadata)
-    for name, (shape, dtype) in stored.items():
-        there = on_disk.get(name)
-        if there is None or (tuple(there.shape), there.dtype) != (shape, dtype):
-            raise _DamagedError(f"{path} is damaged (leaf {name} is not as described)")
-    context = ocp.Context()
-    context.pytree.loading.partial_load = True
-    with context:
-        return _named(ocp.load(path.absolute(), _nested({name: on_disk[name] for name in stored})))
+    with _orbax() as ocp:
+        on_disk = _named(ocp.metadata(path.absolute()).metadata)
+        for name, (shape, dtype) in stored.items():
+            there = on_disk.get(name)
+            if there is None or (tuple(there.shape), there.dtype) != (shape, dtype):
+                raise _DamagedError(f"{path} is damaged (leaf {name} is not as described)")
+        context = ocp.Context()
+        context.pytree.loading.partial_load = True
+        with context:
+            wanted = _nested({name: on_disk[name] for name in stored})
+            return _named(ocp.load(path.absolute(), wanted))
