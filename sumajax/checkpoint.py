@@ -143,7 +143,8 @@ def save(
     except (TypeError, ValueError, RecursionError, AttributeError) as error:
         raise CheckpointError(f"meta must be a dictionary of JSON: {_reason(error)}.") from error
     for name, value, least in (("step", step, 0), ("keep", keep, 1)):
-        if type(value) is not int or not least <= value < 10**18:
+        is_whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+        if not is_whole or not least <= value < 10**18:
             raise CheckpointError(f"{name} must be a whole number from {least}, got {value!r}.")
     leaves, arrays = _host_arrays(state)
     return _write(_claim(root), leaves, arrays, meta, step, keep)
@@ -253,11 +254,11 @@ def rebuild(meta: dict[str, Any]) -> tuple[Environment, Policy]:
                 f"policy {name!r} is not one of {', '.join(POLICIES)}; build it in your program "
                 "and take its parameters with load_params."
             )
-        policy = make_policy(name, env, **_bounded(settings))
-        defaults = {field.name: field.default for field in dataclasses.fields(policy.module)}
-        for setting, value in settings.items():
-            if type(value) is not type(defaults[setting]) and defaults[setting] is not None:
-                raise ValueError(f"policy setting {setting} is {value!r}")
+        settings = _bounded(settings)
+        policy = make_policy(name, env, **settings)
+        for field in dataclasses.fields(policy.module):
+            if field.name in settings and not _fits(settings[field.name], field.default):
+                raise ValueError(f"policy setting {field.name} is {settings[field.name]!r}")
         return env, policy
     except CheckpointError:
         raise
@@ -406,6 +407,13 @@ def _bounded(fields: dict[str, Any]) -> dict[str, Any]:
     return {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
 
 
+def _fits(value: Any, default: Any) -> bool:
+    """Whether a setting has the type of its default, as far as that tells."""
+    if default is None or default is dataclasses.MISSING:
+        return True
+    return type(value) is type(default) or (type(value), type(default)) == (int, float)
+
+
 def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
@@ -545,6 +553,8 @@ def _write(
         _write_description(scratch, leaves, arrays, meta)
         os.rename(scratch, final)
         _sync(root)
+    except CheckpointError:
+        raise
     # Orbax and TensorStore report a full disk, a lost mount and the like by many types.
     except Exception as error:
         raise CheckpointError(
@@ -589,7 +599,10 @@ def _write_description(
     _checked(content)  # nothing is written that the reader would refuse
     text = json.dumps({**content, "checksum": _checksum(content)}, indent=1)
     if len(text) > MAX_DESCRIPTION_BYTES:
-        raise CheckpointError(f"its description is {len(text)} bytes; shorten meta")
+        raise CheckpointError(
+            f"the description of the checkpoint has {len(text)} bytes, more than the "
+            f"{MAX_DESCRIPTION_BYTES} that are read; shorten meta."
+        )
     (path / DESCRIPTION).write_text(text, encoding="utf-8")
     _sync(path / DESCRIPTION)
     for folder, _, _ in os.walk(path):

@@ -434,6 +434,11 @@ class TestNotOurs:
         assert "format 2" in sentence
         assert "newer" in sentence
 
+    def test_what_could_not_be_read_is_not_written(self, tmp_path):
+        meta = {"notes": "x" * checkpoint.MAX_DESCRIPTION_BYTES}
+        assert "shorten meta" in refusal(save, tmp_path / "c", {"w": np.ones(1)}, meta)
+        assert os.listdir(tmp_path / "c") == []
+
     def test_another_format(self, damaged):
         sealed(latest(damaged), format="something else")
         assert "not of sumajax" in refusal(load, damaged)
@@ -795,6 +800,7 @@ class TestDescription:
             (["policy", "settings", "hidden"], "large", "hidden"),
             (["policy", "settings", "hidden"], 10**12, "hidden"),
             (["policy", "settings", "encoder"], "eval", "eval"),
+            (["policy", "settings", "gated"], 1, "gated"),
             (["policy", "settings", "parent"], None, "parent"),
             (["policy", "settings"], [], "usable"),
             (["policy"], "ic3net", "usable"),
