@@ -31,7 +31,7 @@ def held_out_keys(episodes: int = EPISODES) -> chex.PRNGKey:
     return jax.random.split(jax.random.key(HELD_OUT_SEED), episodes)
 
 
-@partial(jax.jit, static_argnames=("env", "policy", "episodes", "greedy"))
+@partial(jax.jit, static_argnames=("env", "policy", "episodes"))
 def evaluate(
     env: Environment,
     policy: Policy,
@@ -39,19 +39,20 @@ def evaluate(
     key: chex.PRNGKey,
     *,
     episodes: int = EPISODES,
-    greedy: bool = False,
+    greedy: chex.Numeric = False,
 ) -> Evaluation:
     """Plays every held-out start once, to its end.
 
     Args:
       key: the policy's own randomness; ignored when greedy.
-      greedy: every choice of the policy (action, gate, edge, bit) is its likeliest one.
+      greedy: every choice of the policy (action, gate, edge, bit) is its likeliest one; may be
+        traced, so both kinds share one compiled program.
     """
     features = state_features(env, policy, params)
 
     def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
         noise = policy.sample_noise(key, (episodes,))
-        noise = jax.tree.map(jnp.zeros_like, noise) if greedy else noise
+        noise = jax.tree.map(lambda x: jnp.where(greedy, 0.0, x), noise)
         carry, output = act(env, policy, params, features, actors, noise)
         return carry, output.action
 
@@ -70,6 +71,12 @@ def evaluate_random(
         return actors.carry, jax.random.categorical(key, logits, shape=shape).astype(jnp.int32)
 
     return _play(env, choose, start(env, policy, held_out_keys(episodes)), key)
+
+
+def shortest_path_steps(env: Environment, episodes: int = EPISODES) -> chex.Array | None:
+    """(episodes,) int32 bound on the held-out starts, for a task that offers `shortest_steps`."""
+    bound = getattr(env, "shortest_steps", None)
+    return None if bound is None else jax.vmap(lambda k: bound(env.reset(k)))(held_out_keys(episodes))
 
 
 def _play(env: Environment, choose: Any, actors: Actors, key: chex.PRNGKey) -> Evaluation:

@@ -122,6 +122,9 @@ class StateUpsampled:
     def active(self, state: Any) -> chex.Array:
         return self.env.active(state)
 
+    def shortest_steps(self, state: Any) -> chex.Array:
+        return self.env.shortest_steps(state)  # type: ignore[attr-defined]
+
     def _transform(self, state: chex.Array) -> chex.Array:
         large = upsample(state, self.factor)
         return large / (self.factor[0] * self.factor[1]) if self.scale == "mass" else large

@@ -138,6 +138,9 @@ class PredatorCapturePrey:
     def active(self, state: State) -> chex.Array:
         return active(self, state)
 
+    def shortest_steps(self, state: State) -> chex.Array:
+        return shortest_steps(self, state)
+
 
 def reset(env: PredatorCapturePrey, key: chex.PRNGKey) -> State:
     """A fresh episode: agents and prey on distinct cells, every placement equally likely."""
@@ -242,6 +245,15 @@ def view(env: PredatorCapturePrey, state: State) -> chex.Array:
 def active(env: PredatorCapturePrey, state: State) -> chex.Array:
     """(N,) bool: not yet on the prey, or on it with the capture still to do."""
     return ~(state.reached & state.captured)
+
+
+def shortest_steps(env: PredatorCapturePrey, state: State) -> chex.Array:
+    """() int32: the fewest steps in which the team can be done if it knew where the prey is.
+
+    The bound that no policy beats: the longest shortest path, one step more for a capture agent.
+    """
+    distance = jnp.abs(state.agents - state.prey).sum(-1)
+    return (distance + (env.agent_class == CAPTURER)).max()
 
 
 def _start(env: PredatorCapturePrey, agents: chex.Array, prey: chex.Array) -> State:

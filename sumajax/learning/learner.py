@@ -69,14 +69,15 @@ class Learner:
     """A policy, its task and how it learns; the methods are pure and can be traced and vmapped.
 
     Attributes:
-      axis: name of the device axis that the environments are spread over, inside `shard_map`;
-        None when one device has them all.
+      axis, shards: name and size of the device axis that the environments are spread over, inside
+        `shard_map`; None and 1 when one device has them all.
     """
 
     env: Environment
     policy: Policy
     config: LearnerConfig
     axis: str | None = None
+    shards: int = 1
 
     def init(self, key: chex.PRNGKey) -> TrainState:
         """Fresh parameters, optimiser and environments."""
@@ -114,10 +115,11 @@ class Learner:
         grads, (actors, tally) = self._gradient(state)
         grads, tally = self._over_devices((grads, tally))
         grads = jax.tree.map(lambda g: g / tally.env_steps, grads)
-        tally = tally.replace(gradient_norm=optax.global_norm(grads))
+        tally = tally.replace(gradient_norm=optax.global_norm(grads), updates=jnp.int32(1))
         optimiser = make_optimiser(self.config)
-        step, opt_state = optimiser.update(grads, state.opt_state, state.params)
-        params = optax.apply_updates(state.params, step)
+        direction, opt_state = optimiser.update(grads, state.opt_state, state.params)
+        rate = self.config.learning_rate * annealed(self.config, state.updates)
+        params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
         next_state = state.replace(
             params=params, opt_state=opt_state, actors=actors, updates=state.updates + 1
         )
@@ -161,9 +163,10 @@ class Learner:
     def _keys(self, key: chex.PRNGKey, update: chex.Array) -> chex.PRNGKey:
         """(E,) keys of one update; each belongs to an environment, whatever device that is on."""
         key = jax.random.fold_in(key, update - START)
-        number = jnp.arange(self.config.num_envs)
+        num_envs = self.config.num_envs // self.shards
+        number = jnp.arange(num_envs)
         if self.axis is not None:
-            number = number + jax.lax.axis_index(self.axis) * self.config.num_envs
+            number = number + jax.lax.axis_index(self.axis) * num_envs
         return jax.vmap(partial(jax.random.fold_in, key))(number)
 
 

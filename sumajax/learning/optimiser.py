@@ -19,7 +19,10 @@ def annealed(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
 
 
 def make_optimiser(config: LearnerConfig) -> optax.GradientTransformation:
-    """Clipping, then Adam or RMSprop, at the annealed learning rate."""
+    """Clipping, then Adam or RMSprop, before the learning rate.
+
+    The rate stays outside, so that memory carried from another stage brings no schedule with it.
+    """
     scale = {
         "adam": optax.scale_by_adam,
         # v <- .97 v + .03 g^2, p <- p - lr g / (sqrt(v) + eps): optax puts eps inside the root unless
@@ -28,7 +31,6 @@ def make_optimiser(config: LearnerConfig) -> optax.GradientTransformation:
             decay=RMSPROP_DECAY, eps=RMSPROP_EPS, initial_scale=0.0, eps_in_sqrt=False
         ),
     }[config.optimiser]()
-    steps = [scale, optax.scale_by_learning_rate(lambda n: config.learning_rate * annealed(config, n))]
-    if config.max_grad_norm is not None and not config.clip_per_env:
-        steps.insert(0, optax.clip_by_global_norm(config.max_grad_norm))
-    return optax.chain(*steps)
+    if config.max_grad_norm is None or config.clip_per_env:
+        return scale
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), scale)

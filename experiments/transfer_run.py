@@ -1,0 +1,504 @@
+"""A transfer experiment: source stage, zero-shot look, then the target twice, with its files.
+
+Shared by `pp_transfer.py` and `pcp_transfer.py`; everything that computes is in the package.
+"""
+
+import csv
+import io
+import json
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import jax
+import numpy as np
+from filelock import FileLock, Timeout
+from jax.sharding import Mesh
+
+from sumajax import checkpoint, reporting
+from sumajax.environments import PredatorCapturePrey
+from sumajax.environments.types import Environment
+from sumajax.evaluation import EPISODES, Evaluation, evaluate, evaluate_random, shortest_path_steps
+from sumajax.learning import EPOCH_STEPS, LearnerConfig, TrainState, make_learner, parallel
+from sumajax.policies import Policy, make_policy
+from sumajax.reporting import metrics as metrics_file
+from sumajax.transfer import (
+    Chunk,
+    Stage,
+    fresh_states,
+    run_stage,
+    saved_epoch,
+    transferred_states,
+)
+from sumajax.upsampling import Scale, StateUpsampled
+
+SOURCE, TRANSFER, SCRATCH = "source", "transfer", "scratch"
+EVALUATION_SEED = 7
+"""Of the policy's own randomness in held-out episodes; the starts are fixed in the package."""
+
+
+@dataclass(frozen=True)
+class TransferConfig:
+    """Options of a transfer experiment; an experiment adds its name and default tasks."""
+
+    experiment: ClassVar[str]
+
+    source: PredatorCapturePrey
+    """The small task, whose state is upsampled to the target's size."""
+    target: PredatorCapturePrey
+    """The large task."""
+    policy: str = "ic3net"
+    """ic3net, commnet, iric, ic, magic, hetnet or hetnet-binary."""
+    preset: Literal["fast", "paper"] = "fast"
+    """fast: this package's learner. paper: the originals' procedure."""
+    seeds: tuple[int, ...] = (0,)
+    """Each trains its own policy; all are reported."""
+    source_epochs: int = 50
+    """Epochs of 20,000 environment steps on the source task."""
+    target_epochs: int = 125
+    """Epochs on the target task, for each of the two arms; 0 stops after the source."""
+    scratch: bool = True
+    """Also train on the target from scratch, with the same budget."""
+    source_checkpoint: Path | None = None
+    """Checkpoints to transfer from, made elsewhere; the source stage is then left out."""
+    output: Path | None = None
+    """Directory of the run; runs/<experiment>-<policy>-<preset> if not given."""
+    scale: Scale = "none"
+    """What upsampling does to the state's mass: none (the paper), or mass (blocks sum to one)."""
+    carry_optimiser: bool = False
+    """Carry the optimiser's memory over with the parameters."""
+    evaluate_every: int = 15
+    """Epochs between held-out evaluations while a target arm trains; 0 for none."""
+    threshold: float = 20.0
+    """Steps taken that count as solved in the comparison."""
+    devices: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """CPU devices to spread seeds and environments over."""
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    """The learner's settings; what is not given comes from the preset."""
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("source_epochs", 1),
+            ("target_epochs", 0),
+            ("evaluate_every", 0),
+            ("devices", 1),
+        ):
+            if getattr(self, name) < least:
+                raise ValueError(
+                    f"{name.replace('_', '-')} must be at least {least}, got {getattr(self, name)}."
+                )
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds) or min(self.seeds) < 0:
+            raise ValueError(f"seeds must be distinct numbers from 0, got {list(self.seeds)}.")
+        if not self.threshold > 0:
+            raise ValueError(f"threshold must be greater than 0, got {self.threshold}.")
+
+    @property
+    def directory(self) -> Path:
+        return self.output or Path("runs") / f"{self.experiment}-{self.policy}-{self.preset}"
+
+
+@dataclass(frozen=True)
+class Run:
+    """An experiment that has been checked: its tasks, its policy for each, its directory."""
+
+    config: TransferConfig
+    source: StateUpsampled
+    source_policy: Policy
+    target_policy: Policy
+
+    @classmethod
+    def of(cls, config: TransferConfig) -> "Run":
+        """Builds both tasks and policies, and refuses what cannot be transferred."""
+        source = StateUpsampled(config.source, config.target.size, config.scale)
+        run = cls(
+            config,
+            source,
+            make_policy(config.policy, source),
+            make_policy(config.policy, config.target),
+        )
+        checkpoint.check_compatible(
+            checkpoint.describe(source, run.source_policy),
+            config.target,
+            run.target_policy,
+            "the source stage",
+        )
+        if config.source_checkpoint is not None:
+            meta = checkpoint.read_meta(config.source_checkpoint)
+            checkpoint.check_compatible(
+                meta, config.target, run.target_policy, config.source_checkpoint
+            )
+        return run
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        return parallel.make_mesh(
+            len(self.config.seeds), self.config.learner.num_envs, self.config.devices
+        )
+
+    def checkpoints(self, arm: str) -> Path:
+        return self.config.directory / "checkpoints" / arm
+
+    def stage(self, arm: str) -> Stage:
+        config = self.config
+        env, policy, epochs = (
+            (self.source, self.source_policy, config.source_epochs)
+            if arm == SOURCE
+            else (config.target, self.target_policy, config.target_epochs)
+        )
+        anneal = epochs if config.preset == "fast" and not config.learner.anneal_epochs else 0
+        learner = replace(config.learner, anneal_epochs=anneal or config.learner.anneal_epochs)
+        return Stage(
+            arm, make_learner(env, policy, learner), epochs, config.seeds, self.checkpoints(arm)
+        )
+
+
+@contextmanager
+def claimed(config: TransferConfig) -> Iterator[Path]:
+    """The run's directory, made or gone on with, and locked against a second run.
+
+    Raises:
+      ValueError: when it holds something else, a finished run, or one with other options.
+      OSError: when it cannot be written.
+    """
+    directory, described = config.directory, _plain(asdict(config))
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(directory / ".lock")
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(f"{directory} is in use by another run; choose another --output.") from None
+    except OSError as error:
+        raise OSError(
+            f"cannot write to {directory} ({error.strerror}); choose another --output."
+        ) from None
+    try:
+        _check_directory(directory, described)
+        reporting.write_json(
+            directory / "config.json",
+            {"command": sys.argv, "options": described, "versions": _versions()},
+        )
+        yield directory
+    finally:
+        lock.release()
+
+
+def _check_directory(directory: Path, described: dict[str, Any]) -> None:
+    file = directory / "config.json"
+    if not file.exists():
+        others = sorted(path.name for path in directory.iterdir() if path.name != ".lock")
+        if others:
+            raise ValueError(
+                f"{directory} exists and holds {others[0]!r}, not a run; choose another --output."
+            )
+        return
+    try:
+        before = json.loads(file.read_text())["options"]
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(f"{file} is not readable; choose another --output.") from None
+    changed = [name for name in described if described[name] != before.get(name, described[name])]
+    if changed:
+        name = changed[0]
+        raise ValueError(
+            f"{directory} holds a run with {name} {before[name]}, not {described[name]}; "
+            "choose another --output, or the same options to go on with it."
+        )
+    if (directory / "summary.json").exists():
+        raise ValueError(f"{directory} holds a finished run; choose another --output or remove it.")
+
+
+class Recorder:
+    """Runs the stages of an experiment and keeps its files up to date."""
+
+    def __init__(self, run: Run, directory: Path, progress: reporting.Progress) -> None:
+        self.run, self.directory, self.progress = run, directory, progress
+        self.metrics = directory / "metrics.csv"
+        self.evaluations = directory / "evaluations.csv"
+        self.arms: dict[str, dict[str, Any]] = {}
+        self.zero_shot: dict[str, dict[str, Any]] = {}
+        self.params: dict[str, Any] = {}
+        self._cost: dict[str, tuple[int, float]] = {}  # env steps and seconds of an arm so far
+
+    def train(self, arm: str, start: Callable[[], TrainState]) -> None:
+        """Trains an arm to its end, a row per seed and epoch on the way, and evaluates it."""
+        stage = self.run.stage(arm)
+        done = saved_epoch(stage)
+        metrics_file.truncate_after(self.metrics, arm, done)
+        _truncate_evaluations(self.evaluations, arm, done)
+        self._cost[arm] = _cost_so_far(self.metrics, arm)
+        self.progress.begin(arm, done)
+        config = self.run.config
+        result = run_stage(
+            stage,
+            start,
+            mesh=self.run.mesh,
+            meta={"experiment": config.experiment, "preset": config.preset},
+            on_chunk=lambda chunk: self._record(stage, chunk),
+            on_resume=lambda epoch: self.progress.say(f"{arm}: going on from epoch {epoch}."),
+        )
+        self.params[arm] = result.states.params
+        env_steps, seconds = self._cost[arm]
+        self.arms[arm] = metrics_file.arm_summary(
+            env_steps=env_steps,
+            epochs=stage.epochs,
+            compile_seconds=result.compile_seconds,
+            train_seconds=seconds,
+            **self.evaluate(stage, result.states.params),
+        )
+
+    def look(self, params: Any) -> None:
+        """Evaluates the source's policy on the target, before any training there."""
+        self.zero_shot = self.evaluate(self.run.stage(TRANSFER), params)
+
+    def evaluate(self, stage: Stage, params: Any) -> dict[str, dict[str, Any]]:
+        """Held-out episodes, `sampled` and `greedy`."""
+        return {
+            mode: _evaluation(stage.learner.env, stage.learner.policy, params, mode == "greedy")
+            for mode in ("sampled", "greedy")
+        }
+
+    def finish(self) -> dict[str, Any]:
+        """Writes curves, replay and, last of all, the summary, and returns it."""
+        config = self.run.config
+        references = _references(self.run)
+        rows = metrics_file.read_metrics(self.metrics)
+        end = TRANSFER if TRANSFER in self.arms else SOURCE
+        task = "target" if TRANSFER in self.arms else "source"
+        reporting.learning_curves(
+            rows, self.directory / "curves.png", bounds=_levels(references[task])
+        )
+        self._replay(end)
+        summary = {
+            "experiment": config.experiment,
+            "policy": config.policy,
+            "preset": config.preset,
+            "seeds": list(config.seeds),
+            "arms": self.arms,
+            "zero_shot": self.zero_shot.get("sampled"),
+            "comparison": metrics_file.comparison(rows, config.threshold),
+            "zero_shot_greedy": self.zero_shot.get("greedy"),
+            "references": references,
+        }
+        metrics_file.write_summary(self.directory / "summary.json", **summary)
+        return summary
+
+    def _record(self, stage: Stage, chunk: Chunk) -> None:
+        """Rows, a held-out evaluation where one is due, and progress."""
+        arm, count = stage.arm, chunk.epoch - chunk.first_epoch
+        steps, seconds = self._cost[arm]
+        env_steps = steps + np.cumsum(np.asarray(chunk.metrics.env_steps), axis=-1)
+        clock = seconds + chunk.seconds * np.arange(1, count + 1) / count
+        values = {name: getattr(chunk.metrics, name) for name in _FIGURES}
+        values |= {"return": chunk.metrics.episode_return, "env_steps": env_steps, "seconds": clock}
+        metrics_file.append_rows(
+            self.metrics, metrics_file.rows_of(arm, stage.seeds, chunk.first_epoch + 1, values)
+        )
+        self._cost[arm] = (int(env_steps[:, -1].mean()), seconds + chunk.seconds)
+        every = self.run.config.evaluate_every
+        if arm != SOURCE and every and chunk.epoch // every > chunk.first_epoch // every:
+            held_out = _evaluation(
+                stage.learner.env, stage.learner.policy, chunk.states.params, greedy=False
+            )
+            _append_evaluation(self.evaluations, stage, chunk.epoch, env_steps[:, -1], held_out)
+        latest = {
+            "steps_taken": float(np.nanmean(chunk.metrics.steps_taken[:, -1])),
+            "success": float(np.nanmean(chunk.metrics.success[:, -1])),
+            "env_steps_per_second": len(stage.seeds) * count * EPOCH_STEPS / chunk.seconds,
+        }
+        self.progress.advance(arm, chunk.epoch, latest)
+
+    def _replay(self, arm: str) -> None:
+        """One held-out episode of the first seed's final policy."""
+        learner = self.run.stage(arm).learner
+        params = jax.tree.map(lambda x: x[0], self.params[arm])
+        episode = reporting.record_episode(
+            learner.env, learner.policy, params, jax.random.key(EVALUATION_SEED), greedy=True
+        )
+        reporting.write_gif(episode, self.directory / "replay.gif")
+
+
+_FIGURES = (
+    "steps_taken",
+    "success",
+    "entropy",
+    "policy_loss",
+    "value_loss",
+    "gradient_norm",
+    "communication",
+)
+"""Columns of metrics.csv that are fields of `Metrics` by the same name."""
+
+
+def _evaluation(env: Environment, policy: Policy, params: Any, greedy: bool) -> dict[str, Any]:
+    """Means over the held-out starts, one per seed of `params` (S, ...)."""
+    num_seeds = jax.tree.leaves(params)[0].shape[0]
+    results = [
+        evaluate(
+            env,
+            policy,
+            jax.tree.map(lambda x, seed=seed: np.asarray(x[seed]), params),
+            jax.random.key(EVALUATION_SEED),
+            greedy=greedy,
+        )
+        for seed in range(num_seeds)
+    ]
+    means = [jax.tree.map(lambda x: float(x.mean()), result) for result in results]
+    return metrics_file.evaluation_summary(
+        EPISODES,
+        [mean.steps_taken for mean in means],
+        [mean.success for mean in means],
+        [mean.episode_return for mean in means],
+    )
+
+
+def _references(run: Run) -> dict[str, dict[str, Any]]:
+    """A random policy and the shortest-path bound on the held-out starts of both tasks."""
+    references = {}
+    for name, env, policy in (
+        ("source", run.source, run.source_policy),
+        ("target", run.config.target, run.target_policy),
+    ):
+        random = evaluate_random(env, policy, jax.random.key(EVALUATION_SEED))
+        bound = shortest_path_steps(env)
+        references[name] = {
+            "random_steps_taken": float(random.steps_taken.mean()),
+            "random_success": float(random.success.mean()),
+            "shortest_path_steps": None if bound is None else float(bound.mean()),
+        }
+    return references
+
+
+def _levels(reference: dict[str, Any]) -> dict[str, float]:
+    levels = {
+        "random policy": reference["random_steps_taken"],
+        "shortest paths": reference["shortest_path_steps"],
+    }
+    return {name: value for name, value in levels.items() if value is not None}
+
+
+def _cost_so_far(metrics: Path, arm: str) -> tuple[int, float]:
+    """Environment steps of a seed, and seconds, in the rows an earlier run left."""
+    if not metrics.exists():
+        return 0, 0.0
+    rows = [row for row in metrics_file.read_metrics(metrics) if row["arm"] == arm]
+    last = [row for row in rows if row["epoch"] == max(r["epoch"] for r in rows)]
+    if not last:
+        return 0, 0.0
+    return int(np.mean([row["env_steps"] for row in last])), last[0]["seconds"]
+
+
+EVALUATION_COLUMNS = ("arm", "seed", "epoch", "env_steps", "steps_taken", "success", "return")
+"""Of evaluations.csv: sampled actions on the held-out starts while a target arm trains."""
+
+
+def _append_evaluation(
+    file: Path, stage: Stage, epoch: int, env_steps: np.ndarray, held_out: dict[str, Any]
+) -> None:
+    rows = _read_evaluations(file)
+    for index, seed in enumerate(stage.seeds):
+        figures = [held_out[name][index] for name in EVALUATION_COLUMNS[4:]]
+        rows.append([stage.arm, seed, epoch, int(env_steps[index]), *figures])
+    _write_evaluations(file, rows)
+
+
+def _truncate_evaluations(file: Path, arm: str, epoch: int) -> None:
+    rows = _read_evaluations(file)
+    kept = [row for row in rows if row[0] != arm or int(row[2]) <= epoch]
+    if len(kept) < len(rows):
+        _write_evaluations(file, kept)
+
+
+def _read_evaluations(file: Path) -> list[list[Any]]:
+    return list(csv.reader(file.read_text().splitlines()))[1:] if file.exists() else []
+
+
+def _write_evaluations(file: Path, rows: list[list[Any]]) -> None:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([EVALUATION_COLUMNS, *rows])
+    reporting.write_text(file, text.getvalue())
+
+
+def _plain(value: Any) -> Any:
+    """`value` as JSON would read it back."""
+    return json.loads(json.dumps(value, default=str))
+
+
+def _versions() -> dict[str, str]:
+    packages = ("sumajax", "jax", "flax", "optax", "orbax-checkpoint", "numpy")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def run_experiment(config: TransferConfig) -> dict[str, Any]:
+    """Runs, or goes on with, the whole experiment; prints its table and returns its summary.
+
+    Raises:
+      ValueError, OSError: one sentence each, before any long work.
+    """
+    run = Run.of(config)
+    arms = [SOURCE] if config.source_checkpoint is None else []
+    if config.target_epochs:
+        arms += [TRANSFER, SCRATCH] if config.scratch else [TRANSFER]
+    epochs = {arm: run.stage(arm).epochs for arm in arms}
+    with claimed(config) as directory, reporting.Progress(epochs) as progress:
+        recorder = Recorder(run, directory, progress)
+        source = config.source_checkpoint or run.checkpoints(SOURCE)
+        if SOURCE in arms:
+            recorder.train(SOURCE, lambda: fresh_states(run.stage(SOURCE)))
+        if TRANSFER in arms:
+            stage = run.stage(TRANSFER)
+
+            def transferred() -> TrainState:
+                return transferred_states(stage, source, carry_optimiser=config.carry_optimiser)
+
+            recorder.look(transferred().params)
+            recorder.train(TRANSFER, transferred)
+        if SCRATCH in arms:
+            recorder.train(SCRATCH, lambda: fresh_states(run.stage(SCRATCH)))
+        summary = recorder.finish()
+    reporting.print_table(table(run, summary), title=f"{config.experiment}: {directory}")
+    return summary
+
+
+def table(run: Run, summary: dict[str, Any]) -> list[dict[str, Any]]:
+    """The closing table: a row per arm and reference, figures per seed."""
+    grid = {
+        "source": "x".join(map(str, run.config.source.shape)),
+        "target": "x".join(map(str, run.config.target.shape)),
+    }
+    rows = []
+    for arm, result in summary["arms"].items():
+        task = grid["source" if arm == SOURCE else "target"]
+        cost = {"M steps": result["env_steps"] / 1e6, "seconds": result["train_seconds"]}
+        rows.append(_row(arm, task, result["evaluation"], **cost))
+        if arm == SOURCE and summary["zero_shot"]:
+            evaluation = {"sampled": summary["zero_shot"], "greedy": summary["zero_shot_greedy"]}
+            rows.append(_row("zero shot", grid["target"], evaluation))
+    for name, reference in summary["references"].items():
+        bound = {"steps_taken": reference["shortest_path_steps"], "success": 1.0}
+        random = {
+            "steps_taken": reference["random_steps_taken"],
+            "success": reference["random_success"],
+        }
+        rows.append(_row("random policy", grid[name], {"sampled": random}))
+        rows.append(_row("shortest paths", grid[name], {"greedy": bound}))
+    return rows
+
+
+def _row(name: str, task: str, evaluation: dict[str, Any], **cost: Any) -> dict[str, Any]:
+    sampled, greedy = evaluation.get("sampled", {}), evaluation.get("greedy", {})
+    return {
+        "policy": name,
+        "grid": task,
+        "steps": sampled.get("steps_taken"),
+        "success": sampled.get("success"),
+        "greedy": greedy.get("steps_taken"),
+        "success (greedy)": greedy.get("success"),
+        "M steps": cost.get("M steps"),
+        "seconds": cost.get("seconds"),
+    }

@@ -1,0 +1,105 @@
+"""Training several seeds, on several devices: the same numbers however they are spread.
+
+Seeds share nothing, so they are spread over devices first; what devices are left over share the
+environments of each seed, and add up their gradients.
+"""
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from sumajax.learning.learner import Learner, Metrics, TrainState
+
+SEEDS, ENVS = "seeds", "envs"
+
+Train = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+
+def use_cpu_devices(count: int) -> None:
+    """Makes JAX see `count` CPU devices, each computing on one thread of its own.
+
+    Only before JAX has been used: one environment shard per core beats threads inside the small
+    matrix products of a step (measured: benchmarks/README.md).
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if count > 1 and "xla_cpu_multi_thread_eigen" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
+    jax.config.update("jax_num_cpu_devices", count)
+
+
+def make_mesh(num_seeds: int, num_envs: int, devices: int) -> Mesh:
+    """`devices` devices as (seeds, envs).
+
+    Raises:
+      ValueError: when there are not so many devices, or seeds and environments do not spread.
+    """
+    if devices > jax.device_count():
+        raise ValueError(f"{devices} devices asked for, but JAX sees {jax.device_count()}.")
+    over_seeds = math.gcd(num_seeds, devices)
+    over_envs = devices // over_seeds
+    if num_envs % over_envs:
+        raise ValueError(
+            f"{num_envs} environments do not spread over {over_envs} devices; choose numbers that "
+            "divide."
+        )
+    return Mesh(np.array(jax.devices()[:devices]).reshape(over_seeds, over_envs), (SEEDS, ENVS))
+
+
+def init_seeds(learner: Learner, seeds: list[int]) -> TrainState:
+    """A fresh training state per seed, stacked along a leading axis."""
+    return jax.jit(jax.vmap(learner.init))(seed_keys(seeds))
+
+
+def seed_keys(seeds: list[int]) -> chex.PRNGKey:
+    """(S,) keys."""
+    return jnp.stack([jax.random.key(seed) for seed in seeds])
+
+
+def make_train(learner: Learner, mesh: Mesh, epochs: int) -> Train:
+    """A compiled function from states stacked over seeds to the states `epochs` epochs later.
+
+    Metrics' leaves are (seeds, epochs).
+    """
+    over_envs = mesh.shape[ENVS]
+    axis = ENVS if over_envs > 1 else None
+    local = replace(learner, axis=axis, shards=over_envs)
+
+    def train(states: TrainState) -> tuple[TrainState, Metrics]:
+        return jax.lax.map(partial(Learner.train, local, epochs=epochs), states)
+
+    specs = state_specs()
+    spread = jax.shard_map(
+        train, mesh=mesh, in_specs=(specs,), out_specs=(specs, P(SEEDS)), check_vma=False
+    )
+    return jax.jit(spread, donate_argnums=0)
+
+
+def state_specs() -> TrainState:
+    """How a stacked `TrainState` lies on the mesh: actors by seed and environment, the rest by seed."""
+    return TrainState(
+        params=P(SEEDS), opt_state=P(SEEDS), actors=P(SEEDS, ENVS), key=P(SEEDS), updates=P(SEEDS)
+    )
+
+
+def place(states: Any, mesh: Mesh) -> Any:
+    """`states` as arrays that lie on the mesh."""
+    specs = state_specs()
+    return TrainState(
+        **{
+            name: jax.tree.map(
+                lambda x, spec=getattr(specs, name): jax.device_put(x, NamedSharding(mesh, spec)),
+                getattr(states, name),
+            )
+            for name in TrainState.__dataclass_fields__
+        }
+    )

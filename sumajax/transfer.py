@@ -1,0 +1,167 @@
+"""Source stage -> checkpoint -> target stage (paper section IV-B), through files.
+
+A stage trains one policy on one task for some epochs, several seeds side by side, and leaves
+checkpoints from which it goes on when it is started again, and from which a target stage starts.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from sumajax import checkpoint
+from sumajax.checkpoint import CheckpointError
+from sumajax.learning import parallel
+from sumajax.learning.learner import Learner, Metrics, TrainState
+
+CHUNK = 5
+"""Epochs of a compiled call: between two looks at the metrics, and between two checkpoints."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What is to be trained.
+
+    Attributes:
+      arm: its name in the files: `source`, `transfer` or `scratch`.
+      directory: of its checkpoints.
+    """
+
+    arm: str
+    learner: Learner
+    epochs: int
+    seeds: tuple[int, ...]
+    directory: Path
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """What came of it: the last states, stacked over seeds, and what this run of it cost."""
+
+    states: TrainState
+    first_epoch: int  # epochs that an earlier run had done
+    compile_seconds: float
+    train_seconds: float
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """News from a stage: epochs `first_epoch`+1 to `epoch` are done."""
+
+    first_epoch: int
+    epoch: int
+    states: TrainState  # stacked over seeds
+    metrics: Metrics  # leaves (seeds, epochs of the chunk)
+    seconds: float  # wall time of the chunk
+
+
+def fresh_states(stage: Stage) -> TrainState:
+    """Untrained states, stacked over the stage's seeds."""
+    return parallel.init_seeds(stage.learner, list(stage.seeds))
+
+
+def transferred_states(
+    stage: Stage, source: Path, *, carry_optimiser: bool = False
+) -> TrainState:
+    """States that start from the parameters in the checkpoints of another stage.
+
+    Everything else, memory and environments included, is fresh; the optimiser's memory too unless
+    `carry_optimiser`. Seed i starts from the source's seed i, or all from its only one.
+
+    Raises:
+      CheckpointError: when there is no good checkpoint, or it does not fit: the sentence names the
+        setting or the leaf and both values.
+    """
+    learner, meta = stage.learner, checkpoint.read_meta(source)
+    checkpoint.check_compatible(meta, learner.env, learner.policy, source)
+    saved_seeds = meta.get("seeds", [0])
+    if len(saved_seeds) not in (1, len(stage.seeds)):
+        raise CheckpointError(
+            f"{source} holds {len(saved_seeds)} seeds, this stage has {len(stage.seeds)}; train as "
+            "many, or transfer from one seed."
+        )
+    fresh = fresh_states(stage)
+    for field in ("params", "opt_state") if carry_optimiser else ("params",):
+        like = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((len(saved_seeds), *x.shape[1:]), x.dtype),
+            getattr(fresh, field),
+        )
+        saved = checkpoint.load_params(source, like, field=field)
+        carried = jax.tree.map(
+            lambda x, y: jnp.broadcast_to(jnp.asarray(x), y.shape), saved, getattr(fresh, field)
+        )
+        fresh = fresh.replace(**{field: carried})
+    return fresh
+
+
+def run_stage(
+    stage: Stage,
+    start: Callable[[], TrainState],
+    *,
+    mesh: Mesh | None = None,
+    meta: dict[str, Any] | None = None,
+    on_chunk: Callable[[Chunk], None] = lambda chunk: None,
+    on_resume: Callable[[int], None] = lambda epoch: None,
+    chunk: int = CHUNK,
+) -> StageResult:
+    """Trains the stage to its end, from its last checkpoint if it has one, else from `start()`.
+
+    Args:
+      mesh: devices, see `learning.parallel`; None: one.
+      meta: added to the description of each checkpoint.
+      on_chunk: called after every chunk, before its checkpoint is written: what it writes may be
+        ahead of the checkpoints when a run is killed, and cut back, but is never behind.
+      on_resume: called first with the epoch that training goes on from.
+    """
+    num_seeds, num_envs = len(stage.seeds), stage.learner.config.num_envs
+    mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
+    first_epoch, states = _resumed(stage, start)
+    if first_epoch:
+        on_resume(first_epoch)
+    states = parallel.place(states, mesh)
+    description = checkpoint.describe(
+        stage.learner.env, stage.learner.policy, arm=stage.arm, seeds=list(stage.seeds), **(meta or {})
+    )
+    if not first_epoch:
+        checkpoint.save(stage.directory, states, {**description, "epoch": 0})
+    compile_seconds = train_seconds = 0.0
+    train, length = None, _chunk_length(stage.epochs, first_epoch, chunk)
+    for epoch in range(first_epoch, stage.epochs, length):
+        if train is None:
+            began = time.perf_counter()
+            train = parallel.make_train(stage.learner, mesh, length).lower(states).compile()
+            compile_seconds = time.perf_counter() - began
+        began = time.perf_counter()
+        states, metrics = jax.block_until_ready(train(states))
+        seconds = time.perf_counter() - began
+        train_seconds += seconds
+        done = epoch + length
+        on_chunk(Chunk(epoch, done, states, jax.device_get(metrics), seconds))
+        checkpoint.save(stage.directory, states, {**description, "epoch": done})
+    return StageResult(states, first_epoch, compile_seconds, train_seconds)
+
+
+def saved_epoch(stage: Stage) -> int:
+    """The epoch that the stage would go on from."""
+    if checkpoint.latest(stage.directory) is None:
+        return 0
+    return checkpoint.read_meta(stage.directory)["epoch"]
+
+
+def _resumed(stage: Stage, start: Callable[[], TrainState]) -> tuple[int, TrainState]:
+    if checkpoint.latest(stage.directory) is None:
+        return 0, start()
+    like = jax.eval_shape(lambda: fresh_states(stage))
+    states, meta = checkpoint.load(stage.directory, like)
+    return meta["epoch"], jax.tree.map(jnp.asarray, states)
+
+
+def _chunk_length(epochs: int, done: int, longest: int) -> int:
+    """The longest chunk that reaches the end in equal parts, so that one program is compiled."""
+    left = epochs - done
+    return max((n for n in range(1, longest + 1) if left % n == 0), default=1)
