@@ -3,11 +3,10 @@
 A policy of your own needs no entry here: `Policy("mine", MyModule(TeamSpec.of(env)))` is one.
 """
 
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 from sumajax.environments.types import Environment
-from sumajax.policies import ic3net
-from sumajax.policies.encoder import ENCODERS
+from sumajax.policies import hetnet, ic3net, magic
 from sumajax.policies.types import Decision, Policy, PolicyModule, PolicyOutput, TeamSpec
 
 __all__ = [
@@ -20,7 +19,11 @@ __all__ = [
     "make_policy",
 ]
 
-POLICIES: dict[str, tuple[type[PolicyModule], dict[str, Any]]] = {**ic3net.VARIANTS}
+POLICIES: dict[str, tuple[type[PolicyModule], dict[str, Any]]] = {
+    **ic3net.VARIANTS,
+    **magic.VARIANTS,
+    **hetnet.VARIANTS,
+}
 """Every named policy: its module and the settings that make it this variant."""
 
 
@@ -42,8 +45,10 @@ def make_policy(name: str, env: Environment, **settings: Any) -> Policy:
         raise ValueError(
             f"policy {name!r} has no setting {unknown[0]!r}; it has {', '.join(sorted(known))}."
         )
-    if settings.get("encoder", "flat") not in ENCODERS:
-        raise ValueError(
-            f"encoder {settings['encoder']!r} is unknown; choose one of {', '.join(ENCODERS)}."
-        )
+    for setting, value in settings.items():
+        choices = module.__dataclass_fields__[setting].type
+        if get_origin(choices) is Literal and value not in get_args(choices):
+            raise ValueError(
+                f"{setting} {value!r} is unknown; choose one of {', '.join(get_args(choices))}."
+            )
     return Policy(name, module(team=TeamSpec.of(env), **variant, **settings))

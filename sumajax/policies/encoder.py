@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 import chex
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 
 from sumajax.policies.layers import Dense, uniform_fan_in
@@ -62,14 +63,46 @@ class ViewEncoder(nn.Module):
     def __call__(self, view: chex.Array) -> chex.Array:
         channels, side = view.shape[-3], view.shape[-1]
         kernel = min(VIEW_KERNEL, side)
-        starts = range(side - kernel + 1)
+        starts, width = range(side - kernel + 1), channels * kernel**2
         patches = jnp.stack(
             [
-                view[..., a : a + kernel, b : b + kernel].reshape(*view.shape[:-3], -1)
+                view[..., a : a + kernel, b : b + kernel].reshape(*view.shape[:-3], width)
                 for a in starts
                 for b in starts
             ],
             axis=-2,
         )
-        x = nn.relu(Dense(VIEW_FEATURES, name="conv", fan_in=channels * kernel**2)(patches))
-        return nn.relu(Dense(VIEW_FEATURES, name="dense")(x.reshape(*view.shape[:-3], -1)))
+        x = nn.relu(Dense(VIEW_FEATURES, name="conv")(patches))
+        x = x.reshape(*view.shape[:-3], len(starts) ** 2 * VIEW_FEATURES)
+        return nn.relu(Dense(VIEW_FEATURES, name="dense")(x))
+
+
+class ObservationEncoder(nn.Module):
+    """State and view -> (..., N, features): one dense layer on [state features | view features].
+
+    It has no activation, as the originals' input layer, so it is kept as its two halves and the
+    state's half is computed once per cell.
+    """
+
+    features: int
+    kind: EncoderKind = "flat"
+
+    def setup(self) -> None:
+        fan_in = STATE_FEATURES + VIEW_FEATURES
+        self.state_encoder = StateEncoder(self.kind)
+        self.view_encoder = ViewEncoder()
+        self.merge_state = Dense(self.features, fan_in=fan_in)
+        self.merge_view = Dense(self.features, use_bias=False, fan_in=fan_in)
+
+    def encode_states(self, states: chex.Array) -> chex.Array:
+        """(S, 1, rows, columns) -> (S, features)."""
+        return self.merge_state(self.state_encoder(states))
+
+    def __call__(
+        self, state_features: chex.Array, view: chex.Array, sighted: np.ndarray
+    ) -> chex.Array:
+        """(..., N, features) of `encode_states`, view (..., N, c, m, m), sighted (N,) bool."""
+        seen = self.view_encoder(view)
+        if not sighted.all():
+            seen = seen * jnp.asarray(sighted, seen.dtype)[:, None]
+        return state_features + self.merge_view(seen)

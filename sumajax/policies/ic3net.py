@@ -12,21 +12,9 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
-from sumajax.policies.encoder import (
-    STATE_FEATURES,
-    VIEW_FEATURES,
-    EncoderKind,
-    StateEncoder,
-    ViewEncoder,
-)
+from sumajax.policies.encoder import EncoderKind, ObservationEncoder
 from sumajax.policies.layers import Dense, LSTMCell
-from sumajax.policies.types import (
-    MASKED_LOGIT,
-    Decision,
-    PolicyModule,
-    PolicyOutput,
-    decide,
-)
+from sumajax.policies.types import Decision, PolicyModule, PolicyOutput, decide, mask_actions
 
 SILENT, TALK = 0, 1
 
@@ -52,7 +40,7 @@ class IC3NetCore(nn.Module):
     def setup(self) -> None:
         passes = self.comm_passes if self.communicates else 0
         self.C = [Dense(self.hidden) for _ in range(passes)]
-        self.lstm = LSTMCell(self.hidden)
+        self.lstm = LSTMCell(self.hidden, self.hidden)
         self.action = Dense(self.num_actions)
         self.value = Dense(1)
         if self.gated:
@@ -94,28 +82,21 @@ class IC3Net(PolicyModule):
     encoder: EncoderKind = "flat"
 
     def setup(self) -> None:
-        self.state_encoder = StateEncoder(self.encoder)
-        self.view_encoder = ViewEncoder()
-        # One dense layer on [state features | view features], kept as its two halves so that the
-        # state's half is computed once per cell.
-        fan_in = STATE_FEATURES + VIEW_FEATURES
-        self.merge_state = Dense(self.hidden, fan_in=fan_in)
-        self.merge_view = Dense(self.hidden, use_bias=False, fan_in=fan_in)
+        self.observation = ObservationEncoder(self.hidden, self.encoder)
         self.core = IC3NetCore(
             self.hidden, self.team.num_actions, self.communicates, self.gated, self.comm_passes
         )
 
     def encode_states(self, states: chex.Array) -> chex.Array:
-        return self.merge_state(self.state_encoder(states))
+        return self.observation.encode_states(states)
 
     def __call__(
         self, carry: IC3NetCarry, state_features: chex.Array, view: chex.Array, noise: Any
     ) -> tuple[IC3NetCarry, PolicyOutput]:
-        sighted = jnp.asarray(self.team.sighted, jnp.float32)[:, None]
-        x = state_features + self.merge_view(self.view_encoder(view) * sighted)
+        x = self.observation(state_features, view, self.team.sighted)
         talked = carry.gate
         h, s, logits, value = self.core(carry, x)
-        action_logits = jnp.where(jnp.asarray(self.team.action_mask), logits["action"], MASKED_LOGIT)
+        action_logits = mask_actions(logits["action"], self.team)
         decisions: dict[str, Decision] = {"action": decide(action_logits, noise["action"])}
         gate = carry.gate
         if self.gated:
@@ -134,7 +115,7 @@ class IC3Net(PolicyModule):
     def initial_carry(self, batch_shape: tuple[int, ...]) -> IC3NetCarry:
         shape = (*batch_shape, self.team.num_agents)
         zeros = jnp.zeros((*shape, self.hidden))
-        # A gated agent starts silent (irrelevant: h is zero); without a gate everybody always talks.
+        # A gated agent starts silent (irrelevant: h is zero); without a gate everybody talks.
         gate = jnp.full(shape, float(self.communicates and not self.gated))
         return IC3NetCarry(zeros, zeros, gate)
 

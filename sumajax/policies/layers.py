@@ -1,4 +1,4 @@
-"""Layers with the originals' parameters and initialisation (algorithms.md of the specification, 1.3).
+"""Layers with the originals' parameters and initialisation (specification, algorithms.md 1.3).
 
 The published programs are PyTorch: dense, convolution and LSTM tensors start uniform within
 +-1/sqrt(fan_in), and an LSTM has two bias vectors, which matters to RMSprop: their sum moves at
@@ -18,8 +18,8 @@ def uniform_fan_in(fan_in: int) -> Initializer:
     """U(-1/sqrt(fan_in), 1/sqrt(fan_in)), the default of the originals' layers."""
     bound = fan_in**-0.5
 
-    def init(key: chex.PRNGKey, shape: Any, dtype: Any = jnp.float32, **_: Any) -> chex.Array:
-        return jax.random.uniform(key, shape, dtype, -bound, bound)
+    def init(key: Any, shape: Any, dtype: Any = None, out_sharding: Any = None) -> chex.Array:
+        return jax.random.uniform(key, shape, dtype or jnp.float32, -bound, bound)
 
     return init
 
@@ -39,22 +39,37 @@ class Dense(nn.Module):
 
 
 class LSTMCell(nn.Module):
-    """z = x w_ih + b_ih + h w_hh + b_hh in blocks i, f, g, o; both products as one."""
+    """z = x w_ih + b_ih + h w_hh + b_hh in blocks i, f, g, o."""
 
     features: int
+    in_features: int
 
-    @nn.compact
+    def setup(self) -> None:
+        init, gates = uniform_fan_in(self.features), 4 * self.features
+        self.w_ih = self.param("w_ih", init, (self.in_features, gates))
+        self.w_hh = self.param("w_hh", init, (self.features, gates))
+        self.b_ih = self.param("b_ih", init, (gates,))
+        self.b_hh = self.param("b_hh", init, (gates,))
+
     def __call__(
         self, carry: tuple[chex.Array, chex.Array], x: chex.Array
     ) -> tuple[chex.Array, chex.Array]:
-        """carry (h, s), each (..., features), and x (..., U) -> the next (h, s)."""
+        """carry (h, s), each (..., H), and x (..., U) -> the next (h, s); one matrix product."""
         h, s = carry
-        init, gates = uniform_fan_in(self.features), 4 * self.features
-        w_ih = self.param("w_ih", init, (x.shape[-1], gates))
-        w_hh = self.param("w_hh", init, (self.features, gates))
-        bias = self.param("b_ih", init, (gates,)) + self.param("b_hh", init, (gates,))
-        z = jnp.concatenate([x, h], axis=-1) @ jnp.concatenate([w_ih, w_hh]) + bias
+        weights = jnp.concatenate([self.w_ih, self.w_hh])
+        z = jnp.concatenate([x, h], axis=-1) @ weights + (self.b_ih + self.b_hh)
         return lstm_gates(z, s)
+
+    def project_input(self, x: chex.Array) -> chex.Array:
+        """x (..., U) -> (..., 4H): its share of z and both biases, for `step_projected`."""
+        return x @ self.w_ih + (self.b_ih + self.b_hh)
+
+    def step_projected(
+        self, carry: tuple[chex.Array, chex.Array], projected: chex.Array
+    ) -> tuple[chex.Array, chex.Array]:
+        """`__call__` with the input already through `project_input`: half the work per step."""
+        h, s = carry
+        return lstm_gates(projected + h @ self.w_hh, s)
 
 
 def lstm_gates(z: chex.Array, s: chex.Array) -> tuple[chex.Array, chex.Array]:
@@ -62,3 +77,16 @@ def lstm_gates(z: chex.Array, s: chex.Array) -> tuple[chex.Array, chex.Array]:
     i, f, g, o = jnp.split(z, 4, axis=-1)
     s = jax.nn.sigmoid(f) * s + jax.nn.sigmoid(i) * jnp.tanh(g)
     return jax.nn.sigmoid(o) * jnp.tanh(s), s
+
+
+def straight_through_bit(logits: chex.Array, noise: chex.Array) -> chex.Array:
+    """Hard binary Gumbel-softmax at temperature 1: component 1 of two-class logits (..., 2).
+
+    The difference of two Gumbel variables is logistic, so one number per bit, `noise` (...,), says
+    all: 1 where logits[1] - logits[0] + noise > 0, else 0. The derivative is that of the sigmoid of
+    the same number.
+    """
+    z = logits[..., 1] - logits[..., 0] + noise
+    soft = jax.nn.sigmoid(z)
+    # hard + (soft - soft), in this order: exactly 0 or 1 in any precision.
+    return (z > 0).astype(soft.dtype) + (soft - jax.lax.stop_gradient(soft))

@@ -6,7 +6,7 @@ the agents of a class and none depends on how many there are: the same parameter
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import chex
 import jax
@@ -35,7 +35,9 @@ class PolicyOutput:
 
     decisions: dict[str, Decision]  # "action", and whatever else is learnt by policy gradient
     value: chex.Array  # (..., N) float32: expected return of each agent
-    communication: chex.Array  # (..., N) float32 in [0, 1]: share of its means an agent used to talk
+    communication: (
+        chex.Array
+    )  # (..., N) float32 in [0, 1]: share of its means an agent used to talk
     attention: chex.Array  # (..., N, N) float32: weight of sender j (column) at receiver i (row)
 
     @property
@@ -114,9 +116,7 @@ class PolicyModule(nn.Module):
         """All the random numbers of `__call__`, so that a rollout can draw them in one go."""
         raise NotImplementedError
 
-    def encode_and_step(
-        self, carry: Any, obs: Observation, noise: Any
-    ) -> tuple[Any, PolicyOutput]:
+    def encode_and_step(self, carry: Any, obs: Observation, noise: Any) -> tuple[Any, PolicyOutput]:
         """`__call__` on the state tensors themselves: the direct path, for any state."""
         flat = obs.state.reshape(-1, *obs.state.shape[-3:])
         features = self.encode_states(flat).reshape(*obs.state.shape[:-3], -1)
@@ -153,11 +153,12 @@ class Policy:
     def apply(
         self, params: Any, carry: Any, obs: Observation, key: chex.PRNGKey
     ) -> tuple[Any, PolicyOutput]:
-        """One step of the team: obs.state (..., N, 1, rows, columns), obs.view (..., N, c, m, m)."""
+        """One team step: obs.state (..., N, 1, rows, columns), obs.view (..., N, c, m, m)."""
         chex.assert_shape(obs.state, (..., *self.team.state_shape))
         chex.assert_shape(obs.view, (..., *self.team.view_shape))
         noise = self.sample_noise(key, obs.view.shape[:-4])
-        return self.module.apply(params, carry, obs, noise, method=self.module.encode_and_step)
+        step = self.module.apply(params, carry, obs, noise, method=self.module.encode_and_step)
+        return cast(tuple[Any, PolicyOutput], step)
 
     def encode_states(self, params: Any, states: chex.Array) -> chex.Array:
         """(S, 1, rows, columns) -> (S, F), for `step`."""
@@ -167,7 +168,8 @@ class Policy:
         self, params: Any, carry: Any, state_features: chex.Array, view: chex.Array, noise: Any
     ) -> tuple[Any, PolicyOutput]:
         """`apply` with the state already encoded and the random numbers already drawn."""
-        return self.module.apply(params, carry, state_features, view, noise)
+        step = self.module.apply(params, carry, state_features, view, noise)
+        return cast(tuple[Any, PolicyOutput], step)
 
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         """The random numbers of `batch_shape` steps."""
@@ -178,3 +180,9 @@ def decide(logits: chex.Array, gumbel: chex.Array) -> Decision:
     """A categorical sample by the Gumbel-max trick; zero noise takes the likeliest choice."""
     choice = jnp.argmax(jax.lax.stop_gradient(logits) + gumbel, axis=-1)
     return Decision(logits=logits, choice=choice.astype(jnp.int32))
+
+
+def mask_actions(logits: chex.Array, team: TeamSpec) -> chex.Array:
+    """(..., N, num_actions) logits with the actions an agent does not have at `MASKED_LOGIT`."""
+    mask = np.array(team.action_mask)
+    return logits if mask.all() else jnp.where(mask, logits, MASKED_LOGIT)

@@ -1,0 +1,430 @@
+"""HetNet (Seraj et al. 2022): graph attention between and within two classes of agents.
+
+Predators (P) see and remember what they saw; capture agents (A) know only where they are. Every
+pair of classes has messages and attention of its own, and a state node per class collects what
+that class's critic reads. Messages are real vectors, or bits that the receivers decode.
+"""
+
+from typing import Any, Literal
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from flax import struct
+from jax.nn.initializers import normal
+
+from sumajax.policies.attention import relation_attention
+from sumajax.policies.encoder import (
+    STATE_FEATURES,
+    VIEW_FEATURES,
+    EncoderKind,
+    StateEncoder,
+    ViewEncoder,
+)
+from sumajax.policies.layers import Dense, LSTMCell, straight_through_bit, uniform_fan_in
+from sumajax.policies.types import (
+    PolicyModule,
+    PolicyOutput,
+    TeamSpec,
+    decide,
+    mask_actions,
+)
+
+Meta = Literal["normalised", "repo"]
+
+NODES = ("P", "A", "S")
+"""Predators, capture agents, and the two state nodes: the first is P's, the second A's."""
+AGENT_RELATIONS = ("p2p", "a2p", "p2a", "a2a")
+STATE_RELATIONS = ("p2s", "a2s")
+"""Relations, sender class first; a state node hears its own class only and tells nobody."""
+
+CLASS_ACTIONS = (5, 6)
+"""Widths of the two classes' heads, whatever the task: a capture agent can also capture."""
+CRITIC_FEATURES = 8
+META_FEATURES = 4
+META_CONSTANT = 500.0
+"""The published program's fourth entry of the team descriptor (its paper says: the time step)."""
+META_SCALE = (10.0, 10.0, 20.0, META_CONSTANT)
+"""Divisors of the default descriptor; the raw one starts the critic 100 times too high."""
+
+
+@struct.dataclass
+class HetNetCarry:
+    """What the agents remember, predators first."""
+
+    h_state: chex.Array  # (..., N, 128) hidden state of the LSTM on the own position
+    s_state: chex.Array  # (..., N, 128) its cell
+    h_obs: chex.Array  # (..., N_P, 32) hidden state of the predators' LSTM on the view
+    s_obs: chex.Array  # (..., N_P, 32) its cell
+
+
+@struct.dataclass
+class Exchange:
+    """What was said in one layer."""
+
+    weights: dict[str, chex.Array]  # by relation with an edge: (..., receivers, senders, K)
+    bits: chex.Array | None  # (..., N, bits) of 0 and 1, for binary messages
+    bit_logits: chex.Array | None  # (..., N, bits, 2)
+
+
+def sender_of(relation: str) -> str:
+    """ "p2a" -> "P"."""
+    return relation[0].upper()
+
+
+def receiver_of(relation: str) -> str:
+    """ "p2a" -> "A"."""
+    return relation[-1].upper()
+
+
+class HetLayer(nn.Module):
+    """One layer of heterogeneous graph attention (algorithms.md 3.3, binary messages 3.4).
+
+    All parameters exist whatever the team, so that they fit any other team.
+
+    Attributes:
+      in_features, features: input width, and output width per head, of P, A and S.
+      average: mean over the heads instead of ReLU and concatenation.
+      bits: length of a binary message; None for real-valued messages.
+    """
+
+    in_features: tuple[int, int, int]
+    features: tuple[int, int, int]
+    heads: int
+    average: bool = False
+    bits: int | None = None
+
+    def setup(self) -> None:
+        self.in_width = dict(zip(NODES, self.in_features, strict=True))
+        self.out_width = dict(zip(NODES, self.features, strict=True))
+        dense: dict[str, tuple[int, int]] = {}
+        for node in NODES:
+            dense[f"self_{node}"] = (self.in_width[node], self.heads * self.out_width[node])
+        for relation in STATE_RELATIONS if self.bits else AGENT_RELATIONS + STATE_RELATIONS:
+            width = self.heads * self.out_width[receiver_of(relation)]
+            dense[relation] = (self.in_width[sender_of(relation)], width)
+        if self.bits:
+            dense["binarize"] = (1, 2)
+            for node in ("P", "A"):
+                dense[f"enc_{node}"] = (self.in_width[node], self.bits)
+                dense[f"dec_{node}"] = (self.bits, self.heads * self.out_width[node])
+        self.dense = {name: self._dense(name, *shape) for name, shape in dense.items()}
+        self.vectors = {name: self._vectors(name) for name in AGENT_RELATIONS + STATE_RELATIONS}
+
+    def _dense(self, name: str, fan_in: int, fan_out: int) -> tuple[chex.Array, chex.Array]:
+        init = uniform_fan_in(fan_in)
+        kernel = self.param(f"{name}_kernel", init, (fan_in, fan_out))
+        return kernel, self.param(f"{name}_bias", init, (fan_out,))
+
+    def _vectors(self, relation: str) -> tuple[chex.Array, chex.Array]:
+        width = self.out_width[receiver_of(relation)]
+        init = normal((4 / ((self.heads + 1) * width)) ** 0.5)
+        dst = self.param(f"{relation}_dst", init, (self.heads, width))
+        return dst, self.param(f"{relation}_src", init, (self.heads, width))
+
+    def __call__(
+        self, features: dict[str, chex.Array], noise: chex.Array | None = None
+    ) -> tuple[dict[str, chex.Array], Exchange]:
+        """One round of messages.
+
+        Args:
+          features: "P" (..., N_P, F_P), "A" (..., N_A, F_A), "S" (..., 2, F_S); a class may be
+            empty.
+          noise: (..., N, bits) logistic, predators first; only for binary messages.
+
+        Returns:
+          the next layer's features by node, and what was said.
+        """
+        relations = present_relations(features["P"].shape[-2], features["A"].shape[-2])
+        linear: dict[str, chex.Array] = {}
+        for node in NODES:
+            linear |= self._apply_dense(self._read_by(node, relations), features[node])
+        bits = bit_logits = None
+        if self.bits:
+            codes = jnp.concatenate([linear["enc_P"], linear["enc_A"]], axis=-2)
+            bits, bit_logits = self._binarize(codes, noise)
+            linear |= self._decode(bits, features["P"].shape[-2])
+        heads = {name: self._split_heads(y) for name, y in linear.items()}
+        state = heads["self_S"]
+        result = {"P": heads["self_P"], "A": heads["self_A"]}
+        result |= {"p2s": state[..., :1, :, :], "a2s": state[..., 1:, :, :]}
+        receivers, weights = dict(result), {}
+        for relation in relations:
+            to = relation if relation in STATE_RELATIONS else receiver_of(relation)
+            heard, weights[relation] = relation_attention(
+                receivers[to],
+                heads[relation],
+                *self.vectors[relation],
+                exclude_self=sender_of(relation) == to,
+            )
+            result[to] = result[to] + heard
+        return self._merge(result), Exchange(weights, bits, bit_logits)
+
+    def _read_by(self, node: str, relations: tuple[str, ...]) -> list[str]:
+        """The dense layers that read a node's features; one product does them all."""
+        sent = [r for r in relations if sender_of(r) == node and r in self.dense]
+        code = [name for name in (f"enc_{node}",) if name in self.dense]
+        return [f"self_{node}", *sent, *code]
+
+    def _apply_dense(self, names: list[str], x: chex.Array) -> dict[str, chex.Array]:
+        """Several dense layers on one input as a single product."""
+        kernels, biases = zip(*(self.dense[name] for name in names), strict=True)
+        y = x @ jnp.concatenate(kernels, axis=1) + jnp.concatenate(biases)
+        ends = np.cumsum([bias.shape[0] for bias in biases])[:-1]
+        return dict(zip(names, jnp.split(y, ends, axis=-1), strict=True))
+
+    def _binarize(
+        self, codes: chex.Array, noise: chex.Array | None
+    ) -> tuple[chex.Array, chex.Array]:
+        """Codes (..., N, bits) -> bits, logits (..., N, bits, 2); one 1 -> 2 layer for all."""
+        kernel, bias = self.dense["binarize"]
+        logits = codes[..., None] * kernel[0] + bias
+        return straight_through_bit(logits, noise), logits
+
+    def _decode(self, bits: chex.Array, num_p: int) -> dict[str, chex.Array]:
+        """Bits (..., N, bits) -> messages by relation; the decoder is the receivers'."""
+        decoded = self._apply_dense(["dec_P", "dec_A"], bits)
+        said_by = {"P": slice(None, num_p), "A": slice(num_p, None)}
+        return {
+            relation: decoded[f"dec_{receiver_of(relation)}"][..., said_by[sender_of(relation)], :]
+            for relation in AGENT_RELATIONS
+        }
+
+    def _split_heads(self, y: chex.Array) -> chex.Array:
+        """(..., N, K O) -> (..., N, K, O)."""
+        return y.reshape(*y.shape[:-1], self.heads, y.shape[-1] // self.heads)
+
+    def _merge(self, result: dict[str, chex.Array]) -> dict[str, chex.Array]:
+        """(..., R, K, O) by receiver -> features by node: head mean, or ReLU and concatenation."""
+        batch = jnp.broadcast_shapes(*(y.shape[:-3] for y in result.values()))
+        state = [
+            jnp.broadcast_to(y, (*batch, *y.shape[-3:])) for y in (result["p2s"], result["a2s"])
+        ]
+        nodes = {"P": result["P"], "A": result["A"], "S": jnp.concatenate(state, axis=-3)}
+        if self.average:
+            return {node: y.mean(-2) for node, y in nodes.items()}
+        return {
+            node: nn.relu(y).reshape(*y.shape[:-2], y.shape[-2] * y.shape[-1])
+            for node, y in nodes.items()
+        }
+
+
+class HetGraph(nn.Module):
+    """Two graph layers and the class critics, from agent features (algorithms.md 3.3, 3.4)."""
+
+    in_features: tuple[int, int]  # of P and A
+    heads: int = 4
+    features: int = 16
+    bits: int | None = None
+
+    def setup(self) -> None:
+        self.layer1 = HetLayer(
+            (*self.in_features, META_FEATURES), (self.features,) * 3, self.heads, bits=self.bits
+        )
+        self.layer2 = HetLayer(
+            (self.heads * self.features,) * 3,
+            (*CLASS_ACTIONS, CRITIC_FEATURES),
+            self.heads,
+            average=True,
+            bits=self.bits,
+        )
+        self.critic_P = Dense(1)
+        self.critic_A = Dense(1)
+
+    def __call__(
+        self, f_p: chex.Array, f_a: chex.Array, meta: chex.Array, noise: chex.Array | None = None
+    ) -> tuple[dict[str, chex.Array], chex.Array, tuple[Exchange, Exchange]]:
+        """f_p (..., N_P, F_P), f_a (..., N_A, F_A), meta (2, 4), noise (..., 2, N, bits) by layer.
+
+        Returns:
+          logits "P" (..., N_P, 5) and "A" (..., N_A, 6), value of each class (..., 2), and what was
+          said in each layer.
+        """
+        noises = (noise[..., 0, :, :], noise[..., 1, :, :]) if noise is not None else (None, None)
+        hidden, first = self.layer1({"P": f_p, "A": f_a, "S": meta}, noises[0])
+        out, second = self.layer2(hidden, noises[1])
+        state = nn.relu(out["S"])
+        critics = (self.critic_P(state[..., 0, :]), self.critic_A(state[..., 1, :]))
+        logits = {"P": out["P"], "A": out["A"]}
+        return logits, jnp.concatenate(critics, axis=-1), (first, second)
+
+
+class HetNetCore(nn.Module):
+    """One step from encoded observations: two LSTMs and the graph layers (algorithms.md 5.2)."""
+
+    state_features: int = STATE_FEATURES
+    view_features: int = VIEW_FEATURES
+    heads: int = 4
+    features: int = 16
+    bits: int | None = None
+
+    def setup(self) -> None:
+        state, view = self.state_features, self.view_features
+        self.lstm_state = LSTMCell(state, state)
+        self.lstm_obs = LSTMCell(view, view)
+        self.graph = HetGraph((state + view, state), self.heads, self.features, self.bits)
+
+    def project_states(self, x_state: chex.Array) -> chex.Array:
+        """Encoded states (..., 128) -> (..., 512), the form `__call__` reads them in."""
+        return self.lstm_state.project_input(x_state)
+
+    def __call__(
+        self,
+        carry: HetNetCarry,
+        projected_state: chex.Array,
+        x_obs: chex.Array,
+        meta: chex.Array,
+        noise: chex.Array | None = None,
+    ) -> tuple[HetNetCarry, dict[str, chex.Array], chex.Array, tuple[Exchange, Exchange]]:
+        """projected_state (..., N, 512), x_obs (..., N_P, 32); the rest as in `HetGraph`."""
+        num_p = x_obs.shape[-2]
+        h_state, s_state = self.lstm_state.step_projected(
+            (carry.h_state, carry.s_state), projected_state
+        )
+        h_obs, s_obs = self.lstm_obs((carry.h_obs, carry.s_obs), x_obs)
+        f_p = jnp.concatenate([h_state[..., :num_p, :], h_obs], axis=-1)
+        logits, value, exchanges = self.graph(f_p, h_state[..., num_p:, :], meta, noise)
+        return HetNetCarry(h_state, s_state, h_obs, s_obs), logits, value, exchanges
+
+
+class HetNet(PolicyModule):
+    """HetNet; with `bits` the agents exchange messages of that many bits.
+
+    Attributes:
+      meta: the team descriptor read by the state nodes: `normalised`
+        [N_P / 10, N_A / 10, rows / 20, 1], or `repo`, the published raw numbers.
+
+    Raises:
+      ValueError: for a team with other classes or actions than P's 5 and A's 6, or with capture
+        agents that see: their features have no place for it.
+    """
+
+    bits: int | None = None
+    meta: Meta = "normalised"
+    encoder: EncoderKind = "flat"
+
+    def __post_init__(self) -> None:
+        _check_team(self.team)
+        super().__post_init__()
+
+    def setup(self) -> None:
+        self.state_encoder = StateEncoder(self.encoder)
+        self.view_encoder = ViewEncoder()
+        self.core = HetNetCore(bits=self.bits)
+
+    def encode_states(self, states: chex.Array) -> chex.Array:
+        return self.core.project_states(self.state_encoder(states))
+
+    def __call__(
+        self, carry: HetNetCarry, state_features: chex.Array, view: chex.Array, noise: Any
+    ) -> tuple[HetNetCarry, PolicyOutput]:
+        num_p, num_a = self.team.class_size(0), self.team.class_size(1)
+        x_obs = self.view_encoder(view[..., :num_p, :, :, :])
+        meta = jnp.asarray(team_descriptor(self.team, self.meta), state_features.dtype)
+        carry, logits, value, exchanges = self.core(
+            carry, state_features, x_obs, meta, noise.get("bits")
+        )
+        agent_logits = mask_actions(_join_logits(logits, self.team.num_actions), self.team)
+        batch = value.shape[:-1]
+        output = PolicyOutput(
+            decisions={"action": decide(agent_logits, noise["action"])},
+            value=jnp.where(np.array(self.team.agent_class) == 1, value[..., 1:], value[..., :1]),
+            communication=_talk(exchanges, (*batch, num_p + num_a)),
+            attention=_attention_matrix(exchanges[0].weights, num_p, num_a, batch),
+        )
+        return carry, output
+
+    def initial_carry(self, batch_shape: tuple[int, ...]) -> HetNetCarry:
+        state = jnp.zeros((*batch_shape, self.team.num_agents, STATE_FEATURES))
+        view = jnp.zeros((*batch_shape, self.team.class_size(0), VIEW_FEATURES))
+        return HetNetCarry(state, state, view, view)
+
+    def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
+        shape = (*batch_shape, self.team.num_agents, self.team.num_actions)
+        action_key, bit_key = jax.random.split(key)
+        noise = {"action": jax.random.gumbel(action_key, shape)}
+        if self.bits:
+            shape = (*batch_shape, 2, self.team.num_agents, self.bits)
+            noise["bits"] = jax.random.logistic(bit_key, shape)
+        return noise
+
+
+def team_descriptor(team: TeamSpec, meta: Meta) -> np.ndarray:
+    """(2, 4): what both state nodes are told about the team and its grid."""
+    raw = [team.class_size(0), team.class_size(1), team.state_shape[-2], META_CONSTANT]
+    scale = META_SCALE if meta == "normalised" else np.ones(META_FEATURES)
+    return np.tile(np.array(raw) / np.array(scale), (2, 1))
+
+
+def present_relations(num_p: int, num_a: int) -> tuple[str, ...]:
+    """Relations with at least one edge: nobody sends to itself, and a class may be empty."""
+    size = {"P": num_p, "A": num_a, "S": 2}
+
+    def present(relation: str) -> bool:
+        sender, receiver = sender_of(relation), receiver_of(relation)
+        return size[receiver] > 0 and size[sender] > int(sender == receiver)
+
+    return tuple(filter(present, AGENT_RELATIONS + STATE_RELATIONS))
+
+
+def _join_logits(logits: dict[str, chex.Array], num_actions: int) -> chex.Array:
+    """Per class (..., N_c, 5 or 6) -> (..., N, num_actions); what is missing is for the mask."""
+    widened = [
+        jnp.pad(y, [(0, 0)] * (y.ndim - 1) + [(0, num_actions - y.shape[-1])])
+        for y in (logits["P"], logits["A"])
+        if y.shape[-2]
+    ]
+    return jnp.concatenate(widened, axis=-2)
+
+
+def _talk(exchanges: tuple[Exchange, ...], shape: tuple[int, ...]) -> chex.Array:
+    """(..., N): share of the bits an agent set, over both layers; 1 for real-valued messages."""
+    bits = [exchange.bits for exchange in exchanges if exchange.bits is not None]
+    return jnp.concatenate(bits, axis=-1).mean(-1) if bits else jnp.ones(shape)
+
+
+def _attention_matrix(
+    weights: dict[str, chex.Array], num_p: int, num_a: int, batch: tuple[int, ...]
+) -> chex.Array:
+    """Weights (..., R, S, K) by relation -> (..., N, N), the mean over the heads.
+
+    The rows of an agent that hears both classes sum to two: each relation is normalised by itself.
+    """
+    size = {"P": num_p, "A": num_a}
+
+    def block(relation: str) -> chex.Array:
+        if relation in weights:
+            return weights[relation].mean(-1)
+        return jnp.zeros((*batch, size[receiver_of(relation)], size[sender_of(relation)]))
+
+    rows = [jnp.concatenate([block(f"p2{to}"), block(f"a2{to}")], axis=-1) for to in ("p", "a")]
+    return jnp.concatenate(rows, axis=-2)
+
+
+def _check_team(team: TeamSpec) -> None:
+    if list(team.agent_class) != sorted(team.agent_class) or max(team.agent_class) > 1:
+        raise ValueError(
+            "hetnet is made for predators (class 0) followed by capture agents (class 1), "
+            f"got agent classes {team.agent_class}."
+        )
+    for agent_class, mask in zip(team.agent_class, team.action_mask, strict=True):
+        width = CLASS_ACTIONS[agent_class]
+        if team.num_actions < width or any(mask[width:]):
+            raise ValueError(
+                f"hetnet gives agents of class {agent_class} {width} actions, but the task has "
+                f"{team.num_actions} and allows them {sum(mask)}; use another policy."
+            )
+    if 1 in team.agent_class and team.sighted_classes[1]:
+        raise ValueError(
+            "hetnet's capture agents have no way to see: set capture_vision=None or use another "
+            "policy."
+        )
+
+
+VARIANTS: dict[str, tuple[type[PolicyModule], dict[str, Any]]] = {
+    "hetnet": (HetNet, {"bits": None}),
+    "hetnet-binary": (HetNet, {"bits": 16}),
+}
+"""Names of this file's policies."""

@@ -1,0 +1,168 @@
+"""MAGIC (Niu et al. 2021): a scheduler draws who hears whom, graph attention carries messages.
+
+Two rounds of messages per step, each over a directed graph drawn edge by edge. Messages reach the
+heads of the same step only: nothing that was heard is remembered.
+"""
+
+from typing import Any, Literal
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from flax import struct
+
+from sumajax.policies.attention import GraphAttention
+from sumajax.policies.encoder import EncoderKind, ObservationEncoder
+from sumajax.policies.layers import Dense, LSTMCell, straight_through_bit, uniform_fan_in
+from sumajax.policies.types import PolicyModule, PolicyOutput, decide, mask_actions
+
+Setting = Literal["medium", "hard"]
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "medium": {"encoder_heads": 8, "second_graph": True, "decode_messages": False},
+    "hard": {"encoder_heads": 4, "second_graph": False, "decode_messages": True},
+}
+"""What differs between the published arguments for 10x10 with 5 agents and 20x20 with 10."""
+
+
+@struct.dataclass
+class MAGICCarry:
+    """What the agents remember."""
+
+    h: chex.Array  # (..., N, H) LSTM hidden state
+    s: chex.Array  # (..., N, H) LSTM cell
+
+
+class Scheduler(nn.Module):
+    """For every ordered pair of agents the logits of an edge, for each of Q graphs.
+
+    An MLP 2G -> G/2 -> G/2 -> 2 on [e_i | e_j] per graph. Its first layer is linear in each half,
+    so it is done per agent, and only a sum of two terms is left to do per pair.
+    """
+
+    in_features: int
+    graphs: int
+
+    def setup(self) -> None:
+        wide, narrow = 2 * self.in_features, self.in_features // 2
+        for layer, (fan_in, fan_out) in enumerate([(wide, narrow), (narrow, narrow), (narrow, 2)]):
+            init, q = uniform_fan_in(fan_in), self.graphs
+            setattr(
+                self, f"kernel_{layer}", self.param(f"kernel_{layer}", init, (q, fan_in, fan_out))
+            )
+            setattr(self, f"bias_{layer}", self.param(f"bias_{layer}", init, (q, fan_out)))
+
+    def __call__(self, e: chex.Array) -> chex.Array:
+        """e (..., N, G) -> logits (..., Q, N, N, 2); row i receives, column j sends."""
+        halves = jnp.split(self.kernel_0, 2, axis=1)
+        receiver, sender = (jnp.einsum("...nc,qcd->...qnd", e, half) for half in halves)
+        bias_0, bias_1, bias_2 = (
+            bias[:, None, None] for bias in (self.bias_0, self.bias_1, self.bias_2)
+        )
+        x = nn.relu(receiver[..., :, None, :] + sender[..., None, :, :] + bias_0)
+        x = nn.relu(jnp.einsum("...qijc,qcd->...qijd", x, self.kernel_1) + bias_1)
+        return jnp.einsum("...qijc,qcd->...qijd", x, self.kernel_2) + bias_2
+
+
+class MAGICCore(nn.Module):
+    """One step from encoded observations: LSTM, scheduler, two rounds of messages, heads.
+
+    Source: algorithms.md 2.1, sizes 2.2.
+    """
+
+    hidden: int
+    num_actions: int
+    encoder_heads: int = 8
+    encoder_features: int = 32
+    first_heads: int = 4
+    first_features: int = 32
+    second_heads: int = 1
+    second_graph: bool = True
+    decode_messages: bool = False
+
+    def setup(self) -> None:
+        hidden, first_width = self.hidden, self.first_heads * self.first_features
+        self.lstm = LSTMCell(hidden, hidden)
+        self.gat_enc = GraphAttention(
+            hidden, self.encoder_heads, self.encoder_features, average=True, self_loop="forced"
+        )
+        self.scheduler = Scheduler(self.encoder_features, graphs=2 if self.second_graph else 1)
+        self.gat1 = GraphAttention(hidden, self.first_heads, self.first_features, normalize=True)
+        self.gat2 = GraphAttention(
+            first_width, self.second_heads, hidden, average=True, normalize=True
+        )
+        if self.decode_messages:
+            self.decoder = Dense(hidden)
+        self.action = Dense(self.num_actions)
+        self.value = Dense(1)
+
+    def __call__(
+        self, carry: MAGICCarry, x: chex.Array, graph_noise: chex.Array
+    ) -> tuple[MAGICCarry, chex.Array, chex.Array, chex.Array, chex.Array]:
+        """x (..., N, H), graph_noise (..., Q, N, N) logistic; Q is 2, or 1 without a second graph.
+
+        Returns:
+          carry, action logits (..., N, num_actions), value (..., N), graphs (..., Q, N, N) 0/1 and
+          the first round's attention (..., N, N), the mean over its heads.
+        """
+        h, s = self.lstm((carry.h, carry.s), x)
+        encoded, _ = self.gat_enc(h)
+        graphs = straight_through_bit(self.scheduler(encoded), graph_noise)
+        message, weights = self.gat1(h, graphs[..., 0, :, :])
+        message, _ = self.gat2(nn.elu(message), graphs[..., -1, :, :])
+        if self.decode_messages:
+            message = self.decoder(message)
+        y = jnp.concatenate([h, message], axis=-1)
+        return MAGICCarry(h, s), self.action(y), self.value(y)[..., 0], graphs, weights.mean(-1)
+
+
+class MAGIC(PolicyModule):
+    """MAGIC with the published arguments for the medium (10x10) or the hard (20x20) task."""
+
+    hidden: int = 128
+    setting: Setting = "medium"
+    encoder: EncoderKind = "flat"
+
+    def setup(self) -> None:
+        self.observation = ObservationEncoder(self.hidden, self.encoder)
+        self.core = MAGICCore(self.hidden, self.team.num_actions, **SETTINGS[self.setting])
+
+    def encode_states(self, states: chex.Array) -> chex.Array:
+        return self.observation.encode_states(states)
+
+    def __call__(
+        self, carry: MAGICCarry, state_features: chex.Array, view: chex.Array, noise: Any
+    ) -> tuple[MAGICCarry, PolicyOutput]:
+        x = self.observation(state_features, view, self.team.sighted)
+        carry, logits, value, graphs, attention = self.core(carry, x, noise["graph"])
+        output = PolicyOutput(
+            decisions={"action": decide(mask_actions(logits, self.team), noise["action"])},
+            value=value,
+            communication=edge_density(graphs),
+            attention=attention,
+        )
+        return carry, output
+
+    def initial_carry(self, batch_shape: tuple[int, ...]) -> MAGICCarry:
+        zeros = jnp.zeros((*batch_shape, self.team.num_agents, self.hidden))
+        return MAGICCarry(zeros, zeros)
+
+    def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
+        n, graphs = self.team.num_agents, 2 if SETTINGS[self.setting]["second_graph"] else 1
+        action_key, graph_key = jax.random.split(key)
+        return {
+            "action": jax.random.gumbel(action_key, (*batch_shape, n, self.team.num_actions)),
+            "graph": jax.random.logistic(graph_key, (*batch_shape, graphs, n, n)),
+        }
+
+
+def edge_density(graphs: chex.Array) -> chex.Array:
+    """Graphs (..., Q, N, N) -> (..., N): share of the others that each sender (column) reaches."""
+    num_agents = graphs.shape[-1]
+    to_others = graphs * (1 - jnp.eye(num_agents, dtype=graphs.dtype))
+    return to_others.sum((-3, -2)) / (graphs.shape[-3] * max(num_agents - 1, 1))
+
+
+VARIANTS: dict[str, tuple[type[PolicyModule], dict[str, Any]]] = {"magic": (MAGIC, {})}
+"""Names of this file's policies."""
