@@ -573,6 +573,15 @@ class TestUntrusted:
         sealed(latest(damaged), **changes)
         assert "describes no state" in refusal(load, damaged)
 
+    def test_links_are_not_followed_wherever_they_lead(self, damaged):
+        newest = latest(damaged)
+        (newest / "state" / "more").symlink_to("/dev/null")
+        sealed(newest)
+        files = json.loads((newest / "checkpoint.json").read_text())["files"]
+        lie = {"bytes": len("/dev/null"), "sha256": hashlib.sha256(b"").hexdigest()}
+        sealed(newest, files={**files, "state/more": lie})
+        assert "more is not a regular file" in refusal(load, newest)
+
     def test_arrays_larger_than_described_are_not_read(self, tmp_path, monkeypatch):
         path = save(tmp_path / "c", {"w": np.ones(4)}, META)
         shutil.rmtree(path / "state")
@@ -653,6 +662,8 @@ class TestKill:
                             os.kill(child, signal.SIGKILL)
                             fatal_event = -1
                 unfinished += any(name.startswith(".") for name in os.listdir(directory))
+                for path in directory.glob("0*"):  # nothing half written or half removed
+                    assert read_meta(path)["epoch"] <= last + 1
                 if last >= 0:
                     state, meta = load(directory, say=pytest.fail)
                     assert last <= state["step"] == meta["epoch"] <= last + 1
