@@ -1,7 +1,7 @@
 """Predator-Capture-Prey: from 5x5 to 10x10 by state upsampling (paper section V).
 
-    python experiments/pcp_transfer.py                       # 2 predators, 1 capture agent -> 3, 2
-    python experiments/pcp_transfer.py --target.num-predators 2 --target.num-capturers 1
+python experiments/pcp_transfer.py                       # 2 predators, 1 capture agent -> 3, 2
+python experiments/pcp_transfer.py --target.num-predators 2 --target.num-capturers 1
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,9 @@ class PCPTransfer(TransferConfig):
 
     experiment: ClassVar[str] = "pcp_transfer"
 
-    source: PredatorCapturePrey = PredatorCapturePrey(size=5, num_predators=2, num_capturers=1, max_steps=80)
+    source: PredatorCapturePrey = PredatorCapturePrey(
+        size=5, num_predators=2, num_capturers=1, max_steps=80
+    )
     """The small task, whose state is upsampled to the target's size."""
     target: PredatorCapturePrey = PredatorCapturePrey(
         size=10, num_predators=3, num_capturers=2, max_steps=200

@@ -1,7 +1,7 @@
 """Predator-Prey: from 5x5 with 3 predators to 10x10 with 5, by state upsampling (paper section V).
 
-    python experiments/pp_transfer.py
-    python experiments/pp_transfer.py --policy commnet --seeds 0 1 2 --output runs/mine
+python experiments/pp_transfer.py
+python experiments/pp_transfer.py --policy commnet --seeds 0 1 2 --output runs/mine
 """
 
 from dataclasses import dataclass
@@ -23,9 +23,7 @@ class PPTransfer(TransferConfig):
 
     source: PredatorPrey = PredatorPrey(size=5, num_predators=3, vision=1, max_steps=80)
     """The small task, whose state is upsampled to the target's size."""
-    target: PredatorPrey = PredatorPrey(
-        size=10, num_predators=5, vision=1, max_steps=200
-    )
+    target: PredatorPrey = PredatorPrey(size=10, num_predators=5, vision=1, max_steps=200)
     """The large task."""
 
 

@@ -25,9 +25,10 @@ from jax.sharding import Mesh
 from sumajax import checkpoint, reporting
 from sumajax.environments import PredatorCapturePrey
 from sumajax.environments.types import Environment
-from sumajax.evaluation import EPISODES, Evaluation, evaluate, evaluate_random, shortest_path_steps
+from sumajax.evaluation import EPISODES, evaluate, evaluate_random, shortest_path_steps
 from sumajax.learning import EPOCH_STEPS, LearnerConfig, TrainState, make_learner, parallel
 from sumajax.policies import Policy, make_policy
+from sumajax.policies.initialisation import Initialisation
 from sumajax.reporting import metrics as metrics_file
 from sumajax.transfer import (
     Chunk,
@@ -117,12 +118,11 @@ class Run:
     def of(cls, config: TransferConfig) -> "Run":
         """Builds both tasks and policies, and refuses what cannot be transferred."""
         source = StateUpsampled(config.source, config.target.size, config.scale)
-        run = cls(
-            config,
-            source,
-            make_policy(config.policy, source),
-            make_policy(config.policy, config.target),
-        )
+        start: Initialisation = "published" if config.preset == "paper" else "amplified"
+        policies = [
+            make_policy(config.policy, env, initialisation=start) for env in (source, config.target)
+        ]
+        run = cls(config, source, *policies)
         checkpoint.check_compatible(
             checkpoint.describe(source, run.source_policy),
             config.target,
@@ -173,7 +173,9 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
         lock = FileLock(directory / ".lock")
         lock.acquire(timeout=0)
     except Timeout:
-        raise ValueError(f"{directory} is in use by another run; choose another --output.") from None
+        raise ValueError(
+            f"{directory} is in use by another run; choose another --output."
+        ) from None
     except OSError as error:
         raise OSError(
             f"cannot write to {directory} ({error.strerror}); choose another --output."

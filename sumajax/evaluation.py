@@ -76,7 +76,9 @@ def evaluate_random(
 def shortest_path_steps(env: Environment, episodes: int = EPISODES) -> chex.Array | None:
     """(episodes,) int32 bound on the held-out starts, for a task that offers `shortest_steps`."""
     bound = getattr(env, "shortest_steps", None)
-    return None if bound is None else jax.vmap(lambda k: bound(env.reset(k)))(held_out_keys(episodes))
+    return (
+        None if bound is None else jax.vmap(lambda k: bound(env.reset(k)))(held_out_keys(episodes))
+    )
 
 
 def _play(env: Environment, choose: Any, actors: Actors, key: chex.PRNGKey) -> Evaluation:
@@ -96,9 +98,7 @@ def _play(env: Environment, choose: Any, actors: Actors, key: chex.PRNGKey) -> E
         carry, actions = choose(actors, jax.random.fold_in(key, time))
         env_state, transition = jax.vmap(env.step)(actors.env_state, actions)
         actors = Actors(env_state, carry, actors.episode_return + transition.reward)
-        now = Evaluation(
-            transition.steps_taken, transition.success, actors.episode_return.mean(-1)
-        )
+        now = Evaluation(transition.steps_taken, transition.success, actors.episode_return.mean(-1))
         result = select(done, result, now)
         return actors, result, done | transition.terminated | transition.truncated, time + 1
 

@@ -6,7 +6,7 @@ checkpoints from which it goes on when it is started again, and from which a tar
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,9 +65,7 @@ def fresh_states(stage: Stage) -> TrainState:
     return parallel.init_seeds(stage.learner, list(stage.seeds))
 
 
-def transferred_states(
-    stage: Stage, source: Path, *, carry_optimiser: bool = False
-) -> TrainState:
+def transferred_states(stage: Stage, source: Path, *, carry_optimiser: bool = False) -> TrainState:
     """States that start from the parameters in the checkpoints of another stage.
 
     Everything else, memory and environments included, is fresh; the optimiser's memory too unless
@@ -95,7 +93,7 @@ def transferred_states(
         carried = jax.tree.map(
             lambda x, y: jnp.broadcast_to(jnp.asarray(x), y.shape), saved, getattr(fresh, field)
         )
-        fresh = fresh.replace(**{field: carried})
+        fresh = replace(fresh, **{field: carried})
     return fresh
 
 
@@ -125,16 +123,21 @@ def run_stage(
         on_resume(first_epoch)
     states = parallel.place(states, mesh)
     description = checkpoint.describe(
-        stage.learner.env, stage.learner.policy, arm=stage.arm, seeds=list(stage.seeds), **(meta or {})
+        stage.learner.env,
+        stage.learner.policy,
+        arm=stage.arm,
+        seeds=list(stage.seeds),
+        **(meta or {}),
     )
     if not first_epoch:
         checkpoint.save(stage.directory, states, {**description, "epoch": 0})
     compile_seconds = train_seconds = 0.0
-    train, length = None, _chunk_length(stage.epochs, first_epoch, chunk)
+    train: parallel.Train | None = None
+    length = _chunk_length(stage.epochs, first_epoch, chunk)
     for epoch in range(first_epoch, stage.epochs, length):
         if train is None:
             began = time.perf_counter()
-            train = parallel.make_train(stage.learner, mesh, length).lower(states).compile()
+            train = parallel.compile_train(stage.learner, mesh, length, states)
             compile_seconds = time.perf_counter() - began
         began = time.perf_counter()
         states, metrics = jax.block_until_ready(train(states))

@@ -1,6 +1,6 @@
 """TrainState, update, epoch: rollout and optimisation as one compiled loop."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -112,29 +112,36 @@ class Learner:
         The gradient is that of the loss summed over agents and steps, divided by the number of
         environment steps (algorithms.md 4.1).
         """
-        grads, (actors, tally) = self._gradient(state)
+        grads, (actors, tally) = self._gradient(state.params, *self._inputs(state), state.updates)
         grads, tally = self._over_devices((grads, tally))
         grads = jax.tree.map(lambda g: g / tally.env_steps, grads)
-        tally = tally.replace(gradient_norm=optax.global_norm(grads), updates=jnp.int32(1))
+        tally = replace(tally, gradient_norm=optax.global_norm(grads), updates=jnp.int32(1))
         optimiser = make_optimiser(self.config)
         direction, opt_state = optimiser.update(grads, state.opt_state, state.params)
         rate = self.config.learning_rate * annealed(self.config, state.updates)
         params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
-        next_state = state.replace(
-            params=params, opt_state=opt_state, actors=actors, updates=state.updates + 1
+        next_state = replace(
+            state, params=params, opt_state=opt_state, actors=actors, updates=state.updates + 1
         )
         return next_state, tally
 
-    def _gradient(self, state: TrainState) -> tuple[Any, tuple[Actors, Tally]]:
+    def _inputs(self, state: TrainState) -> tuple[Actors, Draws]:
+        """Where an update's rollout starts, and all its random numbers."""
         config = self.config
         keys = self._keys(state.key, state.updates)
         actors, length = state.actors, config.rollout_length
         if config.whole_episodes:
-            actors = start(self.env, self.policy, jax.vmap(partial(jax.random.fold_in, data=0))(keys))
+            actors = start(
+                self.env, self.policy, jax.vmap(partial(jax.random.fold_in, data=0))(keys)
+            )
             length += self.env.max_steps - 1
-        draws = draw(self.env, self.policy, keys, length)
-        gradient = jax.grad(self._objective, has_aux=True)
-        return gradient(state.params, actors, draws, state.updates)
+        return actors, draw(self.env, self.policy, keys, length)
+
+    def _gradient(
+        self, params: Any, actors: Actors, draws: Draws, updates: chex.Array
+    ) -> tuple[Any, tuple[Actors, Tally]]:
+        """Gradient of the summed loss, and what the rollout left."""
+        return jax.grad(self._objective, has_aux=True)(params, actors, draws, updates)
 
     def _objective(
         self, params: Any, actors: Actors, draws: Draws, updates: chex.Array
@@ -215,9 +222,7 @@ def summarise(tally: Tally) -> Metrics:
     )
 
 
-def make_learner(
-    env: Environment, policy: Policy, config: LearnerConfig | None = None
-) -> Learner:
+def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None = None) -> Learner:
     """The learner of `policy` on `env`; `config` defaults to the preset `fast`.
 
     Raises:

@@ -36,7 +36,9 @@ LossFunction = Callable[
 def log_prob_and_entropy(decision: Decision) -> tuple[chex.Array, chex.Array]:
     """(...,) log-probability of what was chosen, and entropy in nats, of one decision."""
     log_probs = jax.nn.log_softmax(decision.logits)
-    taken = jnp.take_along_axis(log_probs, decision.choice[..., None], axis=-1)[..., 0]
+    # A product with the one-hot choice, not a gather: its gradient is no scatter.
+    chosen = jax.nn.one_hot(decision.choice, log_probs.shape[-1], dtype=log_probs.dtype)
+    taken = jnp.where(chosen > 0, log_probs, 0.0).sum(-1)
     possible = decision.logits > MASKED_LOGIT / 2
     entropy = -jnp.where(possible, jnp.exp(log_probs) * log_probs, 0.0).sum(-1)
     return taken, entropy

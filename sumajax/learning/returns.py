@@ -16,7 +16,9 @@ def discounted_returns(
     chex.assert_equal_shape([reward, discount])
     chex.assert_equal_shape([reward[0], last_return])
 
-    def back(later: chex.Array, step: tuple[chex.Array, chex.Array]) -> tuple[chex.Array, chex.Array]:
+    def back(
+        later: chex.Array, step: tuple[chex.Array, chex.Array]
+    ) -> tuple[chex.Array, chex.Array]:
         r_t, discount_t = step
         now = r_t + discount_t * later
         return now, now

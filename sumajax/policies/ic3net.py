@@ -13,7 +13,7 @@ from flax import linen as nn
 from flax import struct
 
 from sumajax.policies.encoder import EncoderKind, ObservationEncoder
-from sumajax.policies.layers import Dense, LSTMCell
+from sumajax.policies.layers import Dense, LSTMCell, side_by_side
 from sumajax.policies.types import Decision, PolicyModule, PolicyOutput, decide, mask_actions
 
 SILENT, TALK = 0, 1
@@ -55,10 +55,10 @@ class IC3NetCore(nn.Module):
             h, s = self.lstm((h, s), x + message_layer(mean_message(h, carry.gate)))
         if not self.communicates:
             h, s = self.lstm((h, s), x)
-        logits = {"action": self.action(h)}
-        if self.gated:
-            logits["gate"] = self.gate(h)
-        return h, s, logits, self.value(h)[..., 0]
+        heads = [self.action, self.value, *([self.gate] if self.gated else [])]
+        action, value, *gate = side_by_side(heads, h)
+        logits = {"action": action} | ({"gate": gate[0]} if gate else {})
+        return h, s, logits, value[..., 0]
 
 
 def mean_message(h: chex.Array, gate: chex.Array) -> chex.Array:

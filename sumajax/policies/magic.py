@@ -14,7 +14,13 @@ from flax import struct
 
 from sumajax.policies.attention import GraphAttention
 from sumajax.policies.encoder import EncoderKind, ObservationEncoder
-from sumajax.policies.layers import Dense, LSTMCell, straight_through_bit, uniform_fan_in
+from sumajax.policies.layers import (
+    Dense,
+    LSTMCell,
+    side_by_side,
+    straight_through_bit,
+    uniform_fan_in,
+)
 from sumajax.policies.types import PolicyModule, PolicyOutput, decide, mask_actions
 
 Setting = Literal["medium", "hard"]
@@ -114,7 +120,8 @@ class MAGICCore(nn.Module):
         if self.decode_messages:
             message = self.decoder(message)
         y = jnp.concatenate([h, message], axis=-1)
-        return MAGICCarry(h, s), self.action(y), self.value(y)[..., 0], graphs, weights.mean(-1)
+        action, value = side_by_side([self.action, self.value], y)
+        return MAGICCarry(h, s), action, value[..., 0], graphs, weights.mean(-1)
 
 
 class MAGIC(PolicyModule):
