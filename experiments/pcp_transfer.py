@@ -15,8 +15,8 @@ from sumajax.environments import PredatorCapturePrey
 
 @dataclass(frozen=True)
 class PCPTransfer(TransferConfig):
-    """Predator-Capture-Prey: pre-train on a small grid with upsampled state, transfer to a large one, and
-    compare with training there from scratch.
+    """Predator-Capture-Prey: pre-train on a small grid with upsampled state, transfer to a large
+    one, and compare with training there from scratch.
     """
 
     experiment: ClassVar[str] = "pcp_transfer"

@@ -1,4 +1,4 @@
-"""Held-out episodes, sampled and greedy; a random policy and the shortest-path bound beside them."""
+"""Held-out episodes, sampled and greedy; a random policy and the shortest paths beside them."""
 
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ from sumajax.learning.rollout import Actors, act, select, start, state_features
 from sumajax.policies.types import Policy
 
 HELD_OUT_SEED = 20_240_229
-"""Start cells of the held-out episodes; training keys are folded from small seeds, never from this."""
+"""Of the held-out starts; training keys are folded from small seeds, never from this."""
 EPISODES = 1024
 
 

@@ -34,8 +34,8 @@ class StateUpsampled:
     """A task seen at another task's size: the SUMA-POMDP of paper section IV-B.
 
     N, O, A, T, r and gamma are those of `env`; only the state tensor grows, from `env`'s grid to
-    `size`. With `scale="mass"` a block sums to what its cell held (1/f^2 each), otherwise, as in the
-    paper, each of its cells holds that value.
+    `size`. With `scale="mass"` a block sums to what its cell held (1/f^2 each), otherwise, as in
+    the paper, each of its cells holds that value.
 
     Raises:
       ValueError: when `size` is not a whole multiple of the grid of `env`.
@@ -52,7 +52,8 @@ class StateUpsampled:
             raise ValueError(
                 f"scale {self.scale!r} is unknown; choose one of {', '.join(get_args(Scale))}."
             )
-        (rows, columns), (source_rows, source_columns) = grid_size(self.size), self.env.state_shape[1:]
+        rows, columns = grid_size(self.size)
+        source_rows, source_columns = self.env.state_shape[1:]
         if min(rows, columns) < 1 or rows % source_rows or columns % source_columns:
             raise ValueError(
                 f"the target size {rows}x{columns} is not a whole multiple of the source size "
@@ -116,8 +117,9 @@ class StateUpsampled:
     def state_index(self, state: Any) -> chex.Array:
         return self.env.state_index(state)
 
-    def state_table(self) -> chex.Array:
-        return self._transform(self.env.state_table())
+    def state_table(self) -> chex.Array | None:
+        table = self.env.state_table()
+        return None if table is None else self._transform(table)
 
     def active(self, state: Any) -> chex.Array:
         return self.env.active(state)

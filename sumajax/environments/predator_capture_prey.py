@@ -1,11 +1,11 @@
-"""Predator-Capture-Prey (PCP), and with it the engine of Predator-Prey, its case without capture agents.
+"""Predator-Capture-Prey (PCP), and the engine of Predator-Prey, its case without capture agents.
 
 Predators with limited sight and blind capture agents look for one stationary prey. Everybody must
 reach it, and each capture agent must then also capture it. Source: Seraj et al. 2022 (HetNet) and
 its published program; Singh et al. 2019 (IC3Net) for the predators' part.
 
-`reset`, `step`, `observe` and the rest are plain functions of a frozen configuration; the methods of
-`PredatorCapturePrey` only call them.
+`reset`, `step`, `observe` and the rest are plain functions of a frozen configuration; the methods
+of `PredatorCapturePrey` only call them.
 """
 
 from dataclasses import dataclass
@@ -177,9 +177,7 @@ def state_at(env: PredatorCapturePrey, agents: ArrayLike, prey: ArrayLike) -> St
     return _start(env, agents, prey)
 
 
-def step(
-    env: PredatorCapturePrey, state: State, actions: chex.Array
-) -> tuple[State, Transition]:
+def step(env: PredatorCapturePrey, state: State, actions: chex.Array) -> tuple[State, Transition]:
     """One step of the whole team, without a reset at the end.
 
     Args:
@@ -214,9 +212,7 @@ def step(
 
 def observe(env: PredatorCapturePrey, state: State) -> Observation:
     """Own cell one-hot (N, 1, rows, columns) and entity counts around each agent (N, c, m, m)."""
-    return Observation(
-        state=grid.one_hot_position(state.agents, env.shape), view=view(env, state)
-    )
+    return Observation(state=grid.one_hot_position(state.agents, env.shape), view=view(env, state))
 
 
 def view(env: PredatorCapturePrey, state: State) -> chex.Array:
@@ -267,7 +263,7 @@ def _start(env: PredatorCapturePrey, agents: chex.Array, prey: chex.Array) -> St
 
 
 def _reward(env: PredatorCapturePrey, on_prey: chex.Array, captured: chex.Array) -> chex.Array:
-    """(N,) float32 from the flags after the step, the capturing step itself already paid as done."""
+    """(N,) float32 from the flags after the step: the capturing step itself is paid as done."""
     team_on_prey = on_prey.sum()
     paid_on_prey = {
         "mixed": jnp.float32(0.0),
@@ -305,7 +301,8 @@ def _validate(env: PredatorCapturePrey) -> None:
         value = getattr(env, name)
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise ValueError(f"{name} must be a whole number, got {value!r}.")
-    for name, least in (("num_predators", 0), ("num_capturers", 0), ("vision", 0), ("max_steps", 1)):
+    least_values = {"num_predators": 0, "num_capturers": 0, "vision": 0, "max_steps": 1}
+    for name, least in least_values.items():
         if getattr(env, name) < least:
             raise ValueError(f"{name} must be at least {least}, got {getattr(env, name)}.")
     if env.num_agents < 1:
@@ -335,7 +332,8 @@ def _validate(env: PredatorCapturePrey) -> None:
 
 def _checked_size(size: int | tuple[int, int]) -> tuple[int, int]:
     sides = size if isinstance(size, tuple) else (size,)
-    whole = all(isinstance(side, (int, np.integer)) and not isinstance(side, bool) for side in sides)
+    integers = (int, np.integer)
+    whole = all(isinstance(side, integers) and not isinstance(side, bool) for side in sides)
     if not whole or len(sides) > 2 or min(sides, default=0) < 1:
         raise ValueError(f"size must be a positive int or (rows, columns), got {size!r}.")
     return grid.grid_size(size)

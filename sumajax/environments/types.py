@@ -83,8 +83,9 @@ class Environment(Protocol):
     def state_index(self, state: Any) -> chex.Array:
         """(N,) int32: the row of `state_table()` that is each agent's state tensor."""
 
-    def state_table(self) -> chex.Array:
-        """(S, 1, rows, columns): every state tensor that can occur, so each is encoded only once."""
+    def state_table(self) -> chex.Array | None:
+        """(S, 1, rows, columns): every state tensor that can occur, so each is encoded once; None
+        where there are too many to list."""
 
     def active(self, state: Any) -> chex.Array:
         """(N,) bool: agents whose next action can still change anything."""

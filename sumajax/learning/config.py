@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 EPOCH_STEPS = 20_000
-"""Environment steps of an epoch: 10 updates of 4 processes x 500 steps (paper VII-C; HetNet's runs)."""
+"""Environment steps of an epoch: 10 updates of 4 processes x 500 steps, as the paper's runs."""
 
 Optimiser = Literal["adam", "rmsprop"]
 Loss = Literal["actor_critic", "hetnet"]

@@ -50,7 +50,7 @@ class Tally:
 
 @struct.dataclass
 class Metrics:
-    """Figures of an epoch. Episode figures are of the episodes that ended in it; NaN if none did."""
+    """Figures of an epoch; those of episodes are of the ones that ended in it, NaN if none did."""
 
     env_steps: chex.Array  # () int32
     episodes: chex.Array  # () int32
@@ -101,7 +101,7 @@ class Learner:
         return jax.lax.scan(lambda s, _: self.epoch(s), state, length=epochs)
 
     def epoch(self, state: TrainState) -> tuple[TrainState, Metrics]:
-        """20,000 environment steps (more with `whole_episodes`, whose last ones run to their end)."""
+        """20,000 environment steps, or more with `whole_episodes`, which run to their end."""
         updates = self.config.updates_per_epoch
         state, tallies = jax.lax.scan(lambda s, _: self.update(s), state, length=updates)
         return state, summarise(jax.tree.map(lambda x: x.sum(0), tallies))
@@ -236,7 +236,7 @@ def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None 
             if getattr(policy.team, name) != getattr(spec, name)
         ]
         raise ValueError(
-            f"the policy was made for another task: {'; '.join(differ)}; call make_policy with this "
-            "environment (parameters of the same sizes still fit)."
+            f"the policy was made for another task: {'; '.join(differ)}; call make_policy with "
+            "this environment (parameters of the same sizes still fit)."
         )
     return Learner(env, policy, config or LearnerConfig())

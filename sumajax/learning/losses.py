@@ -56,9 +56,9 @@ def normalise(x: chex.Array, weight: chex.Array, axis: str | None = None) -> che
 def policy_gradient(
     decisions: dict[str, Decision], advantages: chex.Array, weight: chex.Array
 ) -> tuple[chex.Array, chex.Array, chex.Array]:
-    """() sum of -weight * advantage * log pi(choices); entropy sums of all decisions, of the action.
+    """() sum of -weight * advantage * log pi(choices); entropy sums: all decisions, the action.
 
-    Every decision of an agent (its action, its gate) shares the advantage, which is a constant here.
+    Every decision of an agent (its action, its gate) shares the advantage, a constant here.
     """
     pairs = {name: log_prob_and_entropy(decision) for name, decision in decisions.items()}
     log_prob = sum(taken for taken, _ in pairs.values())
@@ -95,8 +95,8 @@ def actor_critic(
 ) -> tuple[chex.Array, LossParts]:
     """Policy gradient with a learnt baseline.
 
-    sum of -advantage * log pi + value_weight (V - R)^2 - entropy_weight H, with R the advantage plus
-    V, or with `team_reward` partly the team's mean of it.
+    sum of -advantage * log pi + value_weight (V - R)^2 - entropy_weight H, with R the advantage
+    plus V, or with `team_reward` partly the team's mean of it.
 
     Args:
       valid: (T, E), 0 for steps that must not count.

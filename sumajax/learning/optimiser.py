@@ -25,8 +25,8 @@ def make_optimiser(config: LearnerConfig) -> optax.GradientTransformation:
     """
     scale = {
         "adam": optax.scale_by_adam,
-        # v <- .97 v + .03 g^2, p <- p - lr g / (sqrt(v) + eps): optax puts eps inside the root unless
-        # told otherwise, which here would damp a thousand times more.
+        # v <- .97 v + .03 g^2, p <- p - lr g / (sqrt(v) + eps): optax puts eps inside the root
+        # unless told otherwise, which here would damp a thousand times more.
         "rmsprop": lambda: optax.scale_by_rms(
             decay=RMSPROP_DECAY, eps=RMSPROP_EPS, initial_scale=0.0, eps_in_sqrt=False
         ),

@@ -89,20 +89,16 @@ def compile_train(learner: Learner, mesh: Mesh, epochs: int, states: TrainState)
 
 
 def state_specs() -> Any:
-    """How a stacked `TrainState` lies on the mesh: actors by seed and environment, the rest by seed."""
+    """How a stacked `TrainState` lies on the mesh: all by seed, actors by environment too."""
     by_seed = P(SEEDS)
     return TrainState(by_seed, by_seed, P(SEEDS, ENVS), by_seed, by_seed)  # type: ignore[arg-type]
 
 
-def place(states: Any, mesh: Mesh) -> Any:
+def place(states: TrainState, mesh: Mesh) -> TrainState:
     """`states` as arrays that lie on the mesh."""
     specs = state_specs()
-    return TrainState(
-        **{
-            name: jax.tree.map(
-                lambda x, spec=getattr(specs, name): jax.device_put(x, NamedSharding(mesh, spec)),
-                getattr(states, name),
-            )
-            for name in TrainState.__dataclass_fields__
-        }
-    )
+
+    def placed(name: str) -> Any:
+        return jax.device_put(getattr(states, name), NamedSharding(mesh, getattr(specs, name)))
+
+    return TrainState(**{name: placed(name) for name in TrainState.__dataclass_fields__})

@@ -1,8 +1,9 @@
-"""Returns and advantages along time. Arrays are (T, ...) time first; `_tm1`-style indices as in rlax:
+"""Returns and advantages along time; arrays are (T, ...), time first.
 
-step t has observation t, reward t+1 is what its action earned, and `discount` is 0 where the episode
-ended with that step.
+Step t has the observation and value of t and the reward that its action earned; `discount` is 0
+where the episode ended with that step.
 """
+
 
 import chex
 import jax
@@ -35,8 +36,8 @@ def generalised_advantages(
 ) -> chex.Array:
     """(T, ...) generalised advantage estimates (Schulman et al. 2016, equation 16).
 
-    delta_t = r_t + discount_t V_{t+1} - V_t, summed with weights (discount lambda)^k up to the end of
-    the episode. With lambda 1 this is the discounted return minus V.
+    delta_t = r_t + discount_t V_{t+1} - V_t, summed with weights (discount lambda)^k up to the end
+    of the episode. With lambda 1 this is the discounted return minus V.
 
     Args:
       reward, discount, value: (T, ...).
@@ -49,6 +50,6 @@ def generalised_advantages(
 
 
 def mix_team(individual: chex.Array, team_weight: float) -> chex.Array:
-    """(..., N): each agent's own part and the team's mean, weighted (`mean_ratio` of the originals)."""
+    """(..., N): each agent's own part and the team's mean, weighted (the originals' mean_ratio)."""
     team = individual.mean(-1, keepdims=True)
     return team_weight * team + (1.0 - team_weight) * individual

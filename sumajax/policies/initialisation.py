@@ -1,10 +1,10 @@
 """How parameters start: as published, or with the signal of the observation amplified.
 
-The originals' layers start uniform within +-1/sqrt(fan_in), a third of the variance that would carry
-a signal through unchanged. Through the four or five layers between the prey in a window and the first
-action that adds up: at the start a prey moves the action's log-probabilities by 1e-4, and it takes
-hundreds of updates before they notice. Gains of about sqrt(6), which keep the variance through a
-layer with ReLU (He et al. 2015), end that: 5x5 Predator-Prey is solved in a fifth of the steps.
+The originals' layers start uniform within +-1/sqrt(fan_in), a third of the variance that would
+carry a signal through unchanged. Through the five layers between the prey in a window and the first
+action that adds up: at the start a prey moves the action's log-probabilities by 1e-3 at most, and
+it takes hundreds of updates before they notice. Gains of about sqrt(6), which keep the variance
+through a layer with ReLU (He et al. 2015), end that.
 """
 
 from typing import Any, Literal
