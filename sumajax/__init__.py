@@ -1,1 +1,23 @@
 """Multi-agent reinforcement learning scaled by state upsampling, as one compiled JAX program."""
+
+from sumajax.checkpoint import load, save
+from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.evaluation import evaluate, load_agent
+from sumajax.learning import LearnerConfig, make_learner, preset
+from sumajax.policies import make_policy
+from sumajax.upsampling import StateUpsampled, upsample
+
+__all__ = [
+    "LearnerConfig",
+    "PredatorCapturePrey",
+    "PredatorPrey",
+    "StateUpsampled",
+    "evaluate",
+    "load",
+    "load_agent",
+    "make_learner",
+    "make_policy",
+    "preset",
+    "save",
+    "upsample",
+]

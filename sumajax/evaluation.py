@@ -1,6 +1,9 @@
 """Held-out episodes, sampled and greedy; a random policy and the shortest paths beside them."""
 
+import os
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import chex
@@ -8,7 +11,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sumajax.environments.types import Environment
+from sumajax import checkpoint
+from sumajax.checkpoint import CheckpointError
+from sumajax.environments.types import Environment, Observation
 from sumajax.learning.rollout import Actors, act, select, start, state_features
 from sumajax.policies.types import Policy
 
@@ -104,3 +109,60 @@ def _play(env: Environment, choose: Any, actors: Actors, key: chex.PRNGKey) -> E
 
     loop = (actors, result, jnp.zeros(episodes, bool), jnp.int32(0))
     return jax.lax.while_loop(unfinished, body, loop)[1]
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A trained policy to act with: pure, batched over any leading axes, traceable."""
+
+    env: Environment
+    policy: Policy
+    params: Any
+
+    def initial_carry(self, batch_shape: tuple[int, ...] = ()) -> Any:
+        """What the team remembers at the start of an episode."""
+        return self.policy.initial_carry(batch_shape)
+
+    def act(
+        self, carry: Any, obs: Observation, key: chex.PRNGKey, *, greedy: bool = False
+    ) -> tuple[Any, chex.Array]:
+        """(next carry, actions (..., N) int32) for obs.state (..., N, 1, rows, columns)."""
+        if greedy:
+            noise = self.policy.sample_noise(key, obs.view.shape[:-4])
+            noise = jax.tree.map(jnp.zeros_like, noise)
+            carry, output = self.policy.apply_with(self.params, carry, obs, noise)
+        else:
+            carry, output = self.policy.apply(self.params, carry, obs, key)
+        return carry, output.action
+
+
+ARMS = ("transfer", "scratch", "source")
+"""Where a run's directory is given: the arm whose policy is meant, first found."""
+
+
+def load_agent(directory: str | os.PathLike[str], *, seed: int = 0) -> Agent:
+    """The policy that a run, or one arm's checkpoint directory, ended with.
+
+    Args:
+      directory: of a run (its transferred policy is taken), of its checkpoints/<arm>, or of one
+        checkpoint.
+      seed: which of the seeds trained side by side, by position.
+
+    Raises:
+      CheckpointError: when there is no good checkpoint, or it does not say what it is of.
+    """
+    root = Path(directory)
+    arms = [root / "checkpoints" / arm for arm in ARMS if (root / "checkpoints" / arm).is_dir()]
+    root = arms[0] if arms else root
+    meta = checkpoint.read_meta(root)
+    env, policy = checkpoint.rebuild(meta)
+    num_seeds = len(meta.get("seeds", ()))
+    like = jax.eval_shape(policy.init, jax.random.key(0))
+    if num_seeds:
+        if not 0 <= seed < num_seeds:
+            raise CheckpointError(f"{root} holds {num_seeds} seeds; there is no seed {seed}.")
+        stacked = jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_seeds, *x.shape), x.dtype), like)
+        params = jax.tree.map(lambda x: x[seed], checkpoint.load_params(root, stacked))
+    else:
+        params = checkpoint.load_params(root, like)
+    return Agent(env, policy, jax.tree.map(jnp.asarray, params))

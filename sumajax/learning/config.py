@@ -32,6 +32,7 @@ class LearnerConfig:
       optimiser, learning_rate: Adam, or RMSprop as the originals set it.
       max_grad_norm: clip of the gradient's global norm; None is no clipping.
       clip_per_env: clip each environment's gradient alone before they are added, as processes do.
+      warmup_epochs: the learning rate rises linearly from 0 over this many epochs.
       anneal_epochs: learning rate and entropy weight fall linearly to `anneal_to` of their start
         over this many epochs; 0 keeps them constant.
       detach_gap: no gradient through the memory past every so many steps of an episode; None: none
@@ -58,6 +59,7 @@ class LearnerConfig:
     learning_rate: float = 1e-3
     max_grad_norm: float | None = 2.0
     clip_per_env: bool = False
+    warmup_epochs: int = 0
     anneal_epochs: int = 0
     anneal_to: float = 0.02
     detach_gap: int | None = None
@@ -145,7 +147,12 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 
 def _validate(config: LearnerConfig) -> None:
-    for name, least in (("num_envs", 1), ("rollout_length", 1), ("anneal_epochs", 0)):
+    for name, least in (
+        ("num_envs", 1),
+        ("rollout_length", 1),
+        ("warmup_epochs", 0),
+        ("anneal_epochs", 0),
+    ):
         value = getattr(config, name)
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")

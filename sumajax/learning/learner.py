@@ -13,7 +13,7 @@ from flax import struct
 from sumajax.environments.types import Environment
 from sumajax.learning.config import LearnerConfig
 from sumajax.learning.losses import LOSSES, LossParts
-from sumajax.learning.optimiser import annealed, make_optimiser
+from sumajax.learning.optimiser import annealed, learning_rate, make_optimiser
 from sumajax.learning.rollout import Actors, Draws, Trajectory, draw, last_value, rollout, start
 from sumajax.policies.types import Policy
 
@@ -118,7 +118,7 @@ class Learner:
         tally = replace(tally, gradient_norm=optax.global_norm(grads), updates=jnp.int32(1))
         optimiser = make_optimiser(self.config)
         direction, opt_state = optimiser.update(grads, state.opt_state, state.params)
-        rate = self.config.learning_rate * annealed(self.config, state.updates)
+        rate = learning_rate(self.config, state.updates)
         params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
         next_state = replace(
             state, params=params, opt_state=opt_state, actors=actors, updates=state.updates + 1

@@ -18,6 +18,19 @@ def annealed(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
     return jnp.maximum(1.0 - (1.0 - config.anneal_to) * done, config.anneal_to)
 
 
+def learning_rate(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
+    """Of the next update, after so many: warmed up, then annealed.
+
+    Adam's first steps have the size of the rate whatever the gradient's: on a policy that was
+    trained elsewhere they are noise, and the warm-up keeps them from wrecking it.
+    """
+    rate = config.learning_rate * annealed(config, updates)
+    if not config.warmup_epochs:
+        return rate
+    warm = (updates + 1) / (config.warmup_epochs * config.updates_per_epoch)
+    return rate * jnp.minimum(warm, 1.0)
+
+
 def make_optimiser(config: LearnerConfig) -> optax.GradientTransformation:
     """Clipping, then Adam or RMSprop, before the learning rate.
 

@@ -4,7 +4,6 @@ Step t has the observation and value of t and the reward that its action earned;
 where the episode ended with that step.
 """
 
-
 import chex
 import jax
 import jax.numpy as jnp

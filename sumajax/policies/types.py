@@ -159,7 +159,12 @@ class Policy:
         """One team step: obs.state (..., N, 1, rows, columns), obs.view (..., N, c, m, m)."""
         chex.assert_shape(obs.state, (..., *self.team.state_shape))
         chex.assert_shape(obs.view, (..., *self.team.view_shape))
-        noise = self.sample_noise(key, obs.view.shape[:-4])
+        return self.apply_with(params, carry, obs, self.sample_noise(key, obs.view.shape[:-4]))
+
+    def apply_with(
+        self, params: Any, carry: Any, obs: Observation, noise: Any
+    ) -> tuple[Any, PolicyOutput]:
+        """`apply` with given random numbers; all zeros make every choice the likeliest."""
         step = self.module.apply(params, carry, obs, noise, method=self.module.encode_and_step)
         return cast(tuple[Any, PolicyOutput], step)
 
