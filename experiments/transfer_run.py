@@ -28,7 +28,6 @@ from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES, evaluate, evaluate_random, shortest_path_steps
 from sumajax.learning import EPOCH_STEPS, LearnerConfig, TrainState, make_learner, parallel
 from sumajax.policies import Policy, make_policy
-from sumajax.policies.initialisation import Initialisation
 from sumajax.reporting import metrics as metrics_file
 from sumajax.transfer import (
     Chunk,
@@ -118,10 +117,7 @@ class Run:
     def of(cls, config: TransferConfig) -> "Run":
         """Builds both tasks and policies, and refuses what cannot be transferred."""
         source = StateUpsampled(config.source, config.target.size, config.scale)
-        start: Initialisation = "published" if config.preset == "paper" else "amplified"
-        policies = [
-            make_policy(config.policy, env, initialisation=start) for env in (source, config.target)
-        ]
+        policies = [make_policy(config.policy, env) for env in (source, config.target)]
         run = cls(config, source, *policies)
         checkpoint.check_compatible(
             checkpoint.describe(source, run.source_policy),

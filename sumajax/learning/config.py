@@ -45,7 +45,7 @@ class LearnerConfig:
     num_envs: int = 50
     rollout_length: int = 10
     whole_episodes: bool = False
-    gamma: float = 0.9
+    gamma: float = 0.95
     gae_lambda: float = 0.95
     bootstrap_timeouts: bool = True
     team_reward: float = 0.0
@@ -54,7 +54,7 @@ class LearnerConfig:
     loss: Loss = "actor_critic"
     value_weight: float = 0.5
     policy_weight: float = 1.0
-    entropy_weight: float = 0.04
+    entropy_weight: float = 0.03
     optimiser: Optimiser = "adam"
     learning_rate: float = 1e-3
     max_grad_norm: float | None = 2.0

@@ -7,7 +7,6 @@ from typing import Any, Literal, get_args, get_origin
 
 from sumajax.environments.types import Environment
 from sumajax.policies import hetnet, ic3net, magic
-from sumajax.policies.initialisation import Initialisation
 from sumajax.policies.types import Decision, Policy, PolicyModule, PolicyOutput, TeamSpec
 
 __all__ = [
@@ -28,14 +27,10 @@ POLICIES: dict[str, tuple[type[PolicyModule], dict[str, Any]]] = {
 """Every named policy: its module and the settings that make it this variant."""
 
 
-def make_policy(
-    name: str, env: Environment, *, initialisation: Initialisation = "amplified", **settings: Any
-) -> Policy:
+def make_policy(name: str, env: Environment, **settings: Any) -> Policy:
     """The policy called `name`, shaped for `env`.
 
     Args:
-      initialisation: how parameters start: `amplified` learns far faster, `published` is the
-        originals'.
       settings: fields of the policy's module, as `hidden=128` or `encoder="flat"`.
 
     Raises:
@@ -50,11 +45,6 @@ def make_policy(
         raise ValueError(
             f"policy {name!r} has no setting {unknown[0]!r}; it has {', '.join(sorted(known))}."
         )
-    if initialisation not in get_args(Initialisation):
-        raise ValueError(
-            f"initialisation {initialisation!r} is unknown; choose one of "
-            f"{', '.join(get_args(Initialisation))}."
-        )
     for setting, value in settings.items():
         if isinstance(value, int) and value < 1 and not isinstance(value, bool):
             raise ValueError(f"policy setting {setting} must be at least 1, got {value}.")
@@ -63,4 +53,4 @@ def make_policy(
             raise ValueError(
                 f"{setting} {value!r} is unknown; choose one of {', '.join(get_args(choices))}."
             )
-    return Policy(name, module(team=TeamSpec.of(env), **variant, **settings), initialisation)
+    return Policy(name, module(team=TeamSpec.of(env), **variant, **settings))

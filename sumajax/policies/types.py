@@ -16,7 +16,6 @@ from flax import linen as nn
 from flax import struct
 
 from sumajax.environments.types import Environment, Observation
-from sumajax.policies.initialisation import Initialisation, amplify
 
 MASKED_LOGIT = -1e9
 """Logit of an action that an agent's class does not have: probability exactly 0 in float32."""
@@ -130,7 +129,6 @@ class Policy:
 
     name: str
     module: PolicyModule
-    initialisation: Initialisation = "amplified"
 
     @property
     def team(self) -> TeamSpec:
@@ -144,10 +142,9 @@ class Policy:
             view=jnp.zeros((team.num_agents, *team.view_shape)),
         )
         noise = jax.tree.map(jnp.zeros_like, self.sample_noise(key, ()))
-        params = self.module.init(
+        return self.module.init(
             key, self.initial_carry(), obs, noise, method=self.module.encode_and_step
         )
-        return amplify(params) if self.initialisation == "amplified" else params
 
     def initial_carry(self, batch_shape: tuple[int, ...] = ()) -> Any:
         """Memory at the start of an episode."""
