@@ -60,9 +60,10 @@ def _parse(experiment: type[TransferConfig], default: TransferConfig) -> Transfe
             return tyro.cli(experiment, default=default)
     except SystemExit as stop:
         if stop.code:
-            lines = [line.strip("│ ") for line in said.getvalue().splitlines() if "│" in line]
-            sentence = " ".join(line for line in lines if line.strip("─"))
-            sentence = sentence.split("For full helptext")[0].strip()
+            # A title, then the text; the frame around them depends on the terminal's encoding.
+            lines = [line.strip("│╭╮╰╯─- ") for line in said.getvalue().splitlines()]
+            sentence = " ".join([line for line in lines if line][1:])
+            sentence = re.split("For full helptext|Argument helptext", sentence)[0].strip()
             raise ValueError(re.sub(r"^Error parsing [\w.-]+: ", "", sentence)) from None
         raise
 

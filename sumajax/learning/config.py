@@ -49,14 +49,14 @@ class LearnerConfig:
     gae_lambda: float = 0.95
     bootstrap_timeouts: bool = True
     team_reward: float = 0.0
-    normalise_advantages: bool = True
+    normalise_advantages: bool = False
     mask_inactive: bool = True
     loss: Loss = "actor_critic"
     value_weight: float = 0.5
     policy_weight: float = 1.0
-    entropy_weight: float = 0.03
+    entropy_weight: float = 0.004
     optimiser: Optimiser = "adam"
-    learning_rate: float = 1e-3
+    learning_rate: float = 1.5e-3
     max_grad_norm: float | None = 2.0
     clip_per_env: bool = False
     warmup_epochs: int = 0
