@@ -26,7 +26,8 @@ class LearnerConfig:
       team_reward: share of the team's mean in each agent's return, 0 to 1.
       normalise_advantages: to mean 0, standard deviation 1 over the batch.
       mask_inactive: no policy gradient for agents whose actions no longer change anything.
-      loss: `actor_critic`, or `hetnet`, the per-class loss of HetNet's published program.
+      loss: `actor_critic`, or `hetnet`, the per-class loss of HetNet's published program, which
+        is of whole episodes only and normalises advantages in its own way.
       value_weight, policy_weight, entropy_weight: of the critic's squared error, of the policy
         gradient and of the entropy bonus.
       optimiser, learning_rate: Adam, or RMSprop as the originals set it.
@@ -171,12 +172,29 @@ def _validate(config: LearnerConfig) -> None:
                 f"{name} {getattr(config, name)!r} is unknown; "
                 f"choose one of {', '.join(get_args(choices))}."
             )
+    if config.loss == "hetnet":
+        _validate_hetnet(config)
     steps = config.num_envs * config.rollout_length
     if EPOCH_STEPS % steps:
         raise ValueError(
             f"{config.num_envs} environments x {config.rollout_length} steps = {steps} steps per "
             f"update do not divide an epoch of {EPOCH_STEPS}; {_nearest(config)} would."
         )
+
+
+def _validate_hetnet(config: LearnerConfig) -> None:
+    needed = {
+        "whole_episodes": True,
+        "bootstrap_timeouts": False,
+        "mask_inactive": False,
+        "team_reward": 0.0,
+    }
+    for name, value in needed.items():
+        if getattr(config, name) != value:
+            raise ValueError(
+                f"loss 'hetnet' needs {name}={value}, got {getattr(config, name)!r}; "
+                "preset 'paper' of policy 'hetnet' has all it needs."
+            )
 
 
 def _nearest(config: LearnerConfig) -> str:

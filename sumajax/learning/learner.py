@@ -12,10 +12,14 @@ from flax import struct
 
 from sumajax.environments.types import Environment
 from sumajax.learning.config import LearnerConfig
-from sumajax.learning.losses import LOSSES, LossParts
+from sumajax.learning.hetnet_loss import hetnet
+from sumajax.learning.losses import LossFunction, LossParts, actor_critic
 from sumajax.learning.optimiser import annealed, learning_rate, make_optimiser
 from sumajax.learning.rollout import Actors, Draws, Trajectory, draw, last_value, rollout, start
 from sumajax.policies.types import Policy
+
+LOSSES: dict[str, LossFunction] = {"actor_critic": actor_critic, "hetnet": hetnet}
+"""By `LearnerConfig.loss`."""
 
 START = -1
 """Update number folded into the keys of the first episodes, before update 0."""
@@ -141,7 +145,14 @@ class Learner:
         self, params: Any, actors: Actors, draws: Draws, updates: chex.Array
     ) -> tuple[Any, tuple[Actors, Tally]]:
         """Gradient of the summed loss, and what the rollout left."""
-        return jax.grad(self._objective, has_aux=True)(params, actors, draws, updates)
+        gradient, limit = jax.grad(self._objective, has_aux=True), self.config.max_grad_norm
+        if limit is None or not self.config.clip_per_env:
+            return gradient(params, actors, draws, updates)
+        lanes = one_environment_each(actors, draws)
+        grads, (actors, tallies) = jax.vmap(gradient, (None, 0, 0, None))(params, *lanes, updates)
+        grads = jax.vmap(partial(clip_by_global_norm, limit=limit))(grads)
+        grads, tally = jax.tree.map(lambda x: x.sum(0), (grads, tallies))
+        return grads, (jax.tree.map(lambda x: x[:, 0], actors), tally)
 
     def _objective(
         self, params: Any, actors: Actors, draws: Draws, updates: chex.Array
@@ -175,6 +186,20 @@ class Learner:
         if self.axis is not None:
             number = number + jax.lax.axis_index(self.axis) * num_envs
         return jax.vmap(partial(jax.random.fold_in, key))(number)
+
+
+def one_environment_each(actors: Actors, draws: Draws) -> tuple[Actors, Draws]:
+    """Leaves (E, ...) and (T, E, ...) -> (E, 1, ...) and (E, T, 1, ...): a batch of one, E times."""
+    return (
+        jax.tree.map(lambda x: x[:, None], actors),
+        jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1)[:, :, None], draws),
+    )
+
+
+def clip_by_global_norm(grads: Any, limit: float) -> Any:
+    """`grads`, made shorter where their norm over all leaves is above `limit`."""
+    scale = jnp.minimum(1.0, limit / optax.global_norm(grads))
+    return jax.tree.map(lambda g: g * scale, grads)
 
 
 def until_episode_end(trajectory: Trajectory, least: int) -> chex.Array:

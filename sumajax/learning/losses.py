@@ -1,7 +1,7 @@
 """Actor-critic losses of a trajectory: sums over time, environments and agents.
 
 A loss is a function of (trajectory, valid, last_value, config, entropy_scale, axis) that returns a
-sum to differentiate and `LossParts` to report; `LOSSES` names them.
+sum to differentiate and `LossParts` to report; `learner.LOSSES` names them.
 """
 
 from collections.abc import Callable
@@ -122,6 +122,3 @@ def actor_critic(
         - config.entropy_weight * entropy_scale * entropy
     )
     return loss, LossParts(policy, critic, action_entropy, acting.sum())
-
-
-LOSSES: dict[str, LossFunction] = {"actor_critic": actor_critic}

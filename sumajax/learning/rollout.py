@@ -42,6 +42,8 @@ class Trajectory:
     success: chex.Array  # (T, E) bool
     steps_taken: chex.Array  # (T, E) int32
     episode_return: chex.Array  # (T, E, N) float32: up to and including this step
+    agent_class: tuple[int, ...] = struct.field(pytree_node=False)  # per agent
+    max_steps: int = struct.field(pytree_node=False)  # the task's step limit
 
     @property
     def last(self) -> chex.Array:
@@ -122,6 +124,7 @@ def rollout(
     """
     features = state_features(env, policy, params)
     beginning = policy.initial_carry((actors.episode_return.shape[0],))
+    agent_class = tuple(env.agent_class.tolist())
 
     def body(actors: Actors, draws: Draws) -> tuple[Actors, Trajectory]:
         active = jax.vmap(env.active)(actors.env_state)
@@ -148,6 +151,8 @@ def rollout(
             truncated=transition.truncated,
             success=transition.success,
             steps_taken=transition.steps_taken,
+            agent_class=agent_class,
+            max_steps=env.max_steps,
         )
         return following, step
 
