@@ -483,8 +483,8 @@ def table(run: Run, summary: dict[str, Any]) -> list[dict[str, Any]]:
             "steps_taken": reference["random_steps_taken"],
             "success": reference["random_success"],
         }
-        rows.append(_row("random policy", grid[name], {"sampled": random}))
-        rows.append(_row("shortest paths", grid[name], {"greedy": bound}))
+        rows.append(_row("random", grid[name], {"sampled": random}))
+        rows.append(_row("shortest", grid[name], {"greedy": bound}))
     return rows
 
 
@@ -496,7 +496,7 @@ def _row(name: str, task: str, evaluation: dict[str, Any], **cost: Any) -> dict[
         "steps": sampled.get("steps_taken"),
         "success": sampled.get("success"),
         "greedy": greedy.get("steps_taken"),
-        "success (greedy)": greedy.get("success"),
+        "(success)": greedy.get("success"),
         "M steps": cost.get("M steps"),
-        "seconds": cost.get("seconds"),
+        "s": cost.get("seconds"),
     }

@@ -271,7 +271,7 @@ def result_table(rows: Sequence[Mapping[str, Any]], title: str | None = None) ->
         return table
     for name in rows[0]:
         left = any(isinstance(row.get(name), str) for row in rows)
-        table.add_column(name, justify="left" if left else "right", overflow="fold")
+        table.add_column(name, justify="left" if left else "right", no_wrap=left)
     for row in rows:
         table.add_row(*(Text(_value(row.get(name))) for name in rows[0]))
     return table
