@@ -377,7 +377,7 @@ def _levels(reference: dict[str, Any]) -> dict[str, float]:
         "random policy": reference["random_steps_taken"],
         "shortest paths": reference["shortest_path_steps"],
     }
-    return {name: value for name, value in levels.items() if value is not None}
+    return {name: round(value, 1) for name, value in levels.items() if value is not None}
 
 
 def _cost_so_far(metrics: Path, arm: str) -> tuple[int, float]:

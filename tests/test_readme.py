@@ -1,0 +1,33 @@
+"""The README's examples, as printed."""
+
+import re
+from pathlib import Path
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+NEEDS_A_RUN = "<!-- needs a finished run -->"
+
+
+def test_the_examples_run(capsys):
+    shared: dict = {}
+    blocks = re.findall(rf"({NEEDS_A_RUN}\n)?```python\n(.*?)```", README, re.DOTALL)
+    assert len(blocks) == 3
+    for needs_a_run, code in blocks:
+        compile(code, "README.md", "exec")
+        if not needs_a_run:
+            exec(code, shared)
+    assert shared["metrics"].env_steps.tolist() == [20_000, 20_000]
+    assert shared["output"].action.shape == (3,)
+    assert shared["states"].agents.shape == (64, 5, 2)
+    assert capsys.readouterr().out
+
+
+def test_every_file_it_links_to_exists():
+    root = Path(__file__).parents[1]
+    for link in re.findall(r"\]\((?!http)([^)#]+)\)", README):
+        assert (root / link).exists(), link
+
+
+def test_the_test_command_is_what_ci_runs():
+    command = "pip install -e '.[dev]' && python -m pytest"
+    assert command in README
+    assert command in (Path(__file__).parents[1] / ".ci" / "run").read_text()

@@ -1,0 +1,105 @@
+"""Source stage -> checkpoint -> target stage: what carries over, what does not, what is refused."""
+
+import jax
+import numpy as np
+import pytest
+
+from sumajax import checkpoint
+from sumajax.checkpoint import CheckpointError
+from sumajax.environments import PredatorPrey
+from sumajax.learning import LearnerConfig, make_learner
+from sumajax.policies import make_policy
+from sumajax.transfer import Stage, _chunk_length, fresh_states, run_stage, transferred_states
+from sumajax.upsampling import StateUpsampled
+
+SOURCE = StateUpsampled(PredatorPrey(size=3, num_predators=2, max_steps=10), 6)
+TARGET = PredatorPrey(size=6, num_predators=3, max_steps=20)
+CONFIG = LearnerConfig(num_envs=100, rollout_length=20)
+
+
+def stage(env, directory, seeds=(0, 1), epochs=1, **settings):
+    policy = make_policy("ic3net", env, **{"hidden": 8, **settings})
+    return Stage("source", make_learner(env, policy, CONFIG), epochs, seeds, directory)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """A trained source stage and its result."""
+    trained = stage(SOURCE, tmp_path_factory.mktemp("source"))
+    return trained, run_stage(trained, lambda: fresh_states(trained))
+
+
+def equal(a, b):
+    return all(map(np.array_equal, jax.tree.leaves(a), jax.tree.leaves(b)))
+
+
+def test_parameters_carry_over_and_nothing_else(source, tmp_path):
+    trained, result = source
+    target = stage(TARGET, tmp_path)
+    states, fresh = transferred_states(target, trained.directory), fresh_states(target)
+    assert equal(states.params, result.states.params)
+    assert not equal(states.params, fresh.params)
+    assert equal(states.opt_state, fresh.opt_state)
+    assert equal(states.actors, fresh.actors)
+    assert states.updates.tolist() == [0, 0]
+
+
+def test_the_optimisers_memory_by_choice(source, tmp_path):
+    trained, result = source
+    states = transferred_states(stage(TARGET, tmp_path), trained.directory, carry_optimiser=True)
+    assert equal(states.opt_state, result.states.opt_state)
+    assert states.updates.tolist() == [0, 0]  # the schedule starts anew
+
+
+def test_one_source_seed_serves_several(source, tmp_path):
+    trained, result = source
+    single = tmp_path / "single"
+    states = jax.tree.map(lambda x: x[:1], result.states)
+    meta = checkpoint.describe(SOURCE, trained.learner.policy, seeds=[0], epoch=1)
+    checkpoint.save(single, states, meta)
+    started = transferred_states(stage(TARGET, tmp_path / "t", seeds=(3, 4, 5)), single)
+    for leaf, of_source in zip(
+        jax.tree.leaves(started.params), jax.tree.leaves(result.states.params), strict=True
+    ):
+        for copy in leaf:
+            np.testing.assert_array_equal(copy, of_source[0])
+
+
+def test_other_numbers_of_seeds_are_refused(source, tmp_path):
+    with pytest.raises(CheckpointError, match="holds 2 seeds, this stage has 3"):
+        transferred_states(stage(TARGET, tmp_path, seeds=(0, 1, 2)), source[0].directory)
+
+
+@pytest.mark.parametrize(
+    ("env", "settings", "sentence"),
+    [
+        (PredatorPrey(size=6, num_predators=3, vision=2), {}, "vision differs: 1 in .*, 2 in this"),
+        (PredatorPrey(size=9, num_predators=3), {}, "grid differs: 6x6 in .*, 9x9 in this stage"),
+        (TARGET, {"hidden": 16}, "policy setting hidden differs: 8 in .*, 16 in this stage"),
+    ],
+    ids=["vision", "grid", "width"],
+)
+def test_what_does_not_fit_is_named(env, settings, sentence, source, tmp_path):
+    with pytest.raises(CheckpointError, match=sentence):
+        transferred_states(stage(env, tmp_path, **settings), source[0].directory)
+
+
+def test_a_missing_source_is_named(tmp_path):
+    with pytest.raises(CheckpointError, match="nowhere"):
+        transferred_states(stage(TARGET, tmp_path), tmp_path / "nowhere")
+
+
+def test_a_finished_stage_is_not_run_again(source):
+    trained, result = source
+    again = run_stage(trained, lambda: pytest.fail("started anew"))
+    assert again.first_epoch == trained.epochs
+    assert again.train_seconds == 0.0
+    assert equal(again.states.params, result.states.params)
+
+
+@pytest.mark.parametrize(
+    ("epochs", "done", "longest", "expected"),
+    [(125, 0, 5, 5), (7, 0, 5, 1), (12, 0, 5, 4), (125, 120, 5, 5), (3, 0, 5, 3), (5, 5, 5, 5)],
+)
+def test_chunks_reach_the_end_in_equal_parts(epochs, done, longest, expected):
+    assert _chunk_length(epochs, done, longest) == expected
