@@ -48,7 +48,8 @@ def plain_errors() -> Iterator[None]:
 def prepare_jax(devices: int) -> None:
     """One CPU device per core, and compiled programs kept for the next time."""
     parallel.use_cpu_devices(devices)
-    if not os.environ.get("SUMAJAX_NO_CACHE") and not jax.config.jax_compilation_cache_dir:
+    elsewhere = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if not os.environ.get("SUMAJAX_NO_CACHE") and not elsewhere:
         jax.config.update("jax_compilation_cache_dir", str(CACHE))
 
 

@@ -272,7 +272,7 @@ class Recorder:
             rows, self.directory / "curves.png", bounds=_levels(references[task])
         )
         self._replay(end)
-        summary = {
+        summary: dict[str, Any] = {
             "experiment": config.experiment,
             "policy": config.policy,
             "preset": config.preset,

@@ -37,8 +37,9 @@ class Environment(Protocol):
     traced, vmapped and scanned. Policies read shapes and classes; the learner reads the rest.
     """
 
-    max_steps: int
-    """The step limit of an episode."""
+    @property
+    def max_steps(self) -> int:
+        """The step limit of an episode."""
 
     @property
     def num_agents(self) -> int:

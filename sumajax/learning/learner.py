@@ -189,7 +189,7 @@ class Learner:
 
 
 def one_environment_each(actors: Actors, draws: Draws) -> tuple[Actors, Draws]:
-    """Leaves (E, ...) and (T, E, ...) -> (E, 1, ...) and (E, T, 1, ...): a batch of one, E times."""
+    """Leaves (E, ...), (T, E, ...) -> (E, 1, ...), (E, T, 1, ...): a batch of one, E times."""
     return (
         jax.tree.map(lambda x: x[:, None], actors),
         jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1)[:, :, None], draws),

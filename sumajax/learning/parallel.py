@@ -28,9 +28,9 @@ def use_cpu_devices(count: int) -> None:
     """Makes JAX see `count` CPU devices; only before JAX has been used.
 
     One shard of the environments per core, without threads inside the small matrix products of a
-    step, took 61 where threads took 76 microseconds per step (5 agents, 100 environments). The compiler's first level of effort
-    halves the time to the first update and costs no speed after it. A flag that is set already
-    stays as it is.
+    step, took 61 where threads took 76 microseconds per environment step (IC3Net, 5 agents, 100
+    environments, two cores). The compiler's first level of effort halves the time to the first
+    update and cost no speed after it. A flag that is set already stays as it is.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     wanted = {"xla_backend_optimization_level": "1"}
