@@ -8,11 +8,15 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 UP, RIGHT, DOWN, LEFT, STAY, CAPTURE = range(6)
 
-OUTSIDE = -1.0
+OUTSIDE = -1
 """What a window shows in every channel where it reaches over the edge of the grid."""
+
+NOWHERE = -(2**14)
+"""Row and column of a cell that no window reaches, to fill up a list of entities."""
 
 
 def grid_size(size: int | tuple[int, int]) -> tuple[int, int]:
@@ -29,12 +33,28 @@ def place_distinct(key: chex.PRNGKey, count: int, size: tuple[int, int]) -> chex
     `count - 1` vector operations, whatever the grid's size.
     """
     rows, columns = size
-    order = jnp.arange(count)
-    slot = jax.random.randint(key, (count,), order, rows * columns)
+    order = np.arange(count, dtype=np.uint32)
+    # `random.randint` would draw twice as many bits. Whole multiples of 8 vectorise.
+    bits = jax.random.bits(key, (-(-count // 8) * 8,), jnp.uint32)[:count]
+    slot = order + scale_to_range(bits, np.uint32(rows * columns) - order)
     cell = slot
     for earlier in reversed(range(count - 1)):
-        cell = jnp.where((cell == slot[earlier]) & (order > earlier), earlier, cell)
-    return jnp.stack([cell // columns, cell % columns], axis=-1).astype(jnp.int32)
+        cell = jnp.where((cell == slot[earlier]) & (order > earlier), np.uint32(earlier), cell)
+    row = cell // columns
+    return jnp.stack([row, cell - row * columns], axis=-1).astype(jnp.int32)
+
+
+def scale_to_range(bits: chex.Array, bound: ArrayLike) -> chex.Array:
+    """floor(bits * bound / 2**32), uint32: random bits as draws from 0..bound-1.
+
+    Exact, from products of 16-bit halves because 64-bit integers are off by default. The
+    probabilities of two draws differ by at most one part in 2**32 / bound.
+    """
+    bound = jnp.asarray(bound, jnp.uint32)
+    high, low = bits >> 16, bits & 0xFFFF
+    bound_high, bound_low = bound >> 16, bound & 0xFFFF
+    middle = high * bound_low + ((low * bound_low) >> 16)
+    return high * bound_high + (middle >> 16) + ((low * bound_high + (middle & 0xFFFF)) >> 16)
 
 
 def move(position: chex.Array, action: chex.Array, size: tuple[int, int]) -> chex.Array:
@@ -42,10 +62,9 @@ def move(position: chex.Array, action: chex.Array, size: tuple[int, int]) -> che
 
     Every action but the four directions, known or not, leaves the cell as it is.
     """
-    down = (action == DOWN).astype(jnp.int32) - (action == UP)
-    right = (action == RIGHT).astype(jnp.int32) - (action == LEFT)
-    limit = jnp.asarray(size, jnp.int32) - 1
-    return jnp.clip(position + jnp.stack([down, right], axis=-1), 0, limit)
+    row = position[..., 0] + (action == DOWN) - (action == UP)
+    column = position[..., 1] + (action == RIGHT) - (action == LEFT)
+    return jnp.stack([jnp.clip(row, 0, size[0] - 1), jnp.clip(column, 0, size[1] - 1)], axis=-1)
 
 
 def cell_index(position: chex.Array, size: tuple[int, int]) -> chex.Array:
@@ -73,18 +92,36 @@ def window_offsets(vision: int) -> np.ndarray:
 
 def window_outside(position: chex.Array, vision: int, size: tuple[int, int]) -> chex.Array:
     """(N, m, m) bool: cells of each agent's window that lie outside the grid."""
-    cell = position[:, None, None, :] + window_offsets(vision)
-    return ((cell < 0) | (cell >= jnp.asarray(size, jnp.int32))).any(-1)
+    reach = jnp.arange(-vision, vision + 1)
+    row = position[:, 0, None, None] + reach[:, None]
+    column = position[:, 1, None, None] + reach
+    return (row < 0) | (row >= size[0]) | (column < 0) | (column >= size[1])
 
 
 def window_count(position: chex.Array, entities: chex.Array, vision: int) -> chex.Array:
-    """(N, m, m) float32: how many of the (M, 2) `entities` stand on each window cell.
+    """(N, c, m, m) int32: how many entities of each class stand on each cell of a window.
+
+    Args:
+      position: (N, 2) cells at the centres of the windows.
+      entities: (c, M, 2) cells of each class, filled up with `NOWHERE`.
+      vision: the window's side is m = 2 vision + 1.
 
     Counts are not clipped to one, and an agent that is one of the entities counts itself.
     """
-    side = 2 * vision + 1
-    relative = entities[None, :, :] - position[:, None, :] + vision  # (N, M, 2)
-    seen = ((relative >= 0) & (relative < side)).all(-1)
-    window_cell = jnp.where(seen, relative[..., 0] * side + relative[..., 1], -1)  # (N, M)
-    hits = window_cell[..., None] == jnp.arange(side * side)
-    return hits.sum(1).astype(jnp.float32).reshape(-1, side, side)
+    reach = jnp.arange(-vision, vision + 1)
+    window = _number(position)[:, None, None] + (reach[:, None] * _ROW + reach)  # (N, m, m)
+    # One elementwise comparison and one sum for all classes: several arrays put together, or a
+    # choice between them, cost XLA's CPU code more than the counting.
+    hits = window[:, None, None] == _number(entities)[:, :, None, None]  # (N, c, M, m, m)
+    return hits.sum(2)
+
+
+_ROW = 2**16
+
+
+def _number(cell: chex.Array) -> chex.Array:
+    """(...,) int32 that differ where the (..., 2) cells do, also those outside the grid.
+
+    Sums of numbers are numbers of sums, as long as sides stay below 2**14.
+    """
+    return cell[..., 0] * _ROW + cell[..., 1]

@@ -9,6 +9,7 @@ of `PredatorCapturePrey` only call them.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Literal, get_args
 
 import chex
@@ -221,14 +222,10 @@ def view(env: PredatorCapturePrey, state: State) -> chex.Array:
     Cells outside the grid are -1 in every channel. A blind agent reads zeros; one with less vision
     than the window reads -1 beyond it.
     """
-    cells = {
-        "predators": state.agents[: env.num_predators],
-        "capturers": state.agents[env.num_predators :],
-        "prey": state.prey[None],
-    }
-    counts = [grid.window_count(state.agents, cells[name], env.vision) for name in env.entities]
+    counts = grid.window_count(state.agents, _entities(env, state), env.vision)
     outside = grid.window_outside(state.agents, env.vision, env.shape)
-    seen = jnp.where(outside[:, None], grid.OUTSIDE, jnp.stack(counts, axis=1))
+    # Nobody stands outside, so the counts there are zero.
+    seen = (counts + grid.OUTSIDE * outside[:, None]).astype(jnp.float32)
     if env.num_capturers == 0:
         return seen
     is_capturer = (env.agent_class == CAPTURER)[:, None, None, None]
@@ -236,6 +233,19 @@ def view(env: PredatorCapturePrey, state: State) -> chex.Array:
         return jnp.where(is_capturer, 0.0, seen)
     beyond = np.abs(grid.window_offsets(env.vision)).max(-1) > env.capture_vision
     return jnp.where(is_capturer & beyond, grid.OUTSIDE, seen)
+
+
+def _entities(env: PredatorCapturePrey, state: State) -> chex.Array:
+    """(c, M, 2) int32: the cells of each class, filled up to the largest class."""
+    cells = {
+        "predators": state.agents[: env.num_predators],
+        "capturers": state.agents[env.num_predators :],
+        "prey": state.prey[None],
+    }
+    most = max(env.num_predators, env.num_capturers, 1)
+    fill_up = partial(jnp.pad, constant_values=grid.NOWHERE)
+    classes = [cells[name] for name in env.entities]
+    return jnp.stack([fill_up(c, ((0, most - c.shape[0]), (0, 0))) for c in classes])
 
 
 def active(env: PredatorCapturePrey, state: State) -> chex.Array:
@@ -249,7 +259,7 @@ def shortest_steps(env: PredatorCapturePrey, state: State) -> chex.Array:
     The bound that no policy beats: the longest shortest path, one step more for a capture agent.
     """
     distance = jnp.abs(state.agents - state.prey).sum(-1)
-    return (distance + (env.agent_class == CAPTURER)).max()
+    return (distance + ~state.captured).max()
 
 
 def _start(env: PredatorCapturePrey, agents: chex.Array, prey: chex.Array) -> State:
