@@ -119,7 +119,7 @@ class Learner:
         grads, (actors, tally) = self._gradient(state.params, *self._inputs(state), state.updates)
         grads, tally = self._over_devices((grads, tally))
         grads = jax.tree.map(lambda g: g / tally.env_steps, grads)
-        tally = replace(tally, gradient_norm=optax.global_norm(grads), updates=jnp.int32(1))
+        tally = replace(tally, gradient_norm=optax.tree.norm(grads), updates=jnp.int32(1))
         optimiser = make_optimiser(self.config)
         direction, opt_state = optimiser.update(grads, state.opt_state, state.params)
         rate = learning_rate(self.config, state.updates)
@@ -198,7 +198,7 @@ def one_environment_each(actors: Actors, draws: Draws) -> tuple[Actors, Draws]:
 
 def clip_by_global_norm(grads: Any, limit: float) -> Any:
     """`grads`, made shorter where their norm over all leaves is above `limit`."""
-    scale = jnp.minimum(1.0, limit / optax.global_norm(grads))
+    scale = jnp.minimum(1.0, limit / optax.tree.norm(grads))
     return jax.tree.map(lambda g: g * scale, grads)
 
 
