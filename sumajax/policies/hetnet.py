@@ -70,12 +70,12 @@ class Exchange:
 
 
 def sender_of(relation: str) -> str:
-    """ "p2a" -> "P"."""
+    """The class that sends in a relation: P for "p2a"."""
     return relation[0].upper()
 
 
 def receiver_of(relation: str) -> str:
-    """ "p2a" -> "A"."""
+    """The class that receives in a relation: A for "p2a"."""
     return relation[-1].upper()
 
 
@@ -143,7 +143,8 @@ class HetLayer(nn.Module):
             linear |= self._apply_dense(self._read_by(node, relations), features[node])
         bits = bit_logits = None
         if self.bits:
-            codes = jnp.concatenate([linear["enc_P"], linear["enc_A"]], axis=-2)
+            # Codes are no messages: they have no heads, and any number of bits will do.
+            codes = jnp.concatenate([linear.pop("enc_P"), linear.pop("enc_A")], axis=-2)
             bits, bit_logits = self._binarize(codes, noise)
             linear |= self._decode(bits, features["P"].shape[-2])
         heads = {name: self._split_heads(y) for name, y in linear.items()}

@@ -116,7 +116,7 @@ class IC3Net(PolicyModule):
         shape = (*batch_shape, self.team.num_agents)
         zeros = jnp.zeros((*shape, self.hidden))
         # A gated agent starts silent (irrelevant: h is zero); without a gate everybody talks.
-        gate = jnp.full(shape, float(self.communicates and not self.gated))
+        gate = jnp.full(shape, float(self.communicates and not self.gated), zeros.dtype)
         return IC3NetCarry(zeros, zeros, gate)
 
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:

@@ -1,0 +1,140 @@
+"""Graph attention: which senders count, by how much, and what the graph learns from it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sumajax.policies.attention import GraphAttention, relation_attention
+
+AGENTS, INPUTS, HEADS, FEATURES = 4, 6, 2, 3
+
+GRAPH = jnp.array(
+    [
+        [1.0, 0.0, 1.0, 0.0],
+        [0.0, 0.0, 0.0, 0.0],  # hears nobody
+        [1.0, 1.0, 1.0, 1.0],  # hears everybody
+        [0.0, 1.0, 0.0, 0.0],
+    ]
+)
+ISOLATED, FULL = 1, 2
+
+
+def attend(graph, **settings):
+    """Output, weights and the function of messages and graph that gave them."""
+    layer = GraphAttention(INPUTS, HEADS, FEATURES, **settings)
+    m = jax.random.normal(jax.random.key(0), (AGENTS, INPUTS))
+    params = layer.init(jax.random.key(1), m)
+
+    def output(m, graph):
+        return layer.apply(params, m, graph)
+
+    return *output(m, graph), output, m
+
+
+def masked_softmax(output, m):
+    """The weights over present edges only, from the complete graph's unnormalised ones."""
+    _, complete = output(m, jnp.ones_like(GRAPH))
+    present = complete * GRAPH[..., None]
+    return present / jnp.maximum(present.sum(1, keepdims=True), 1e-9)
+
+
+@pytest.mark.parametrize("average", [False, True])
+def test_normalised_weights_are_a_softmax_over_the_present_edges(average):
+    _, weights, output, m = attend(GRAPH, normalize=True, average=average)
+    np.testing.assert_allclose(weights, masked_softmax(output, m), atol=1e-6)
+
+
+def test_an_isolated_receiver_hears_its_bias_only():
+    y, weights, *_ = attend(GRAPH, normalize=True)
+    np.testing.assert_array_equal(weights[ISOLATED], 0)
+    np.testing.assert_array_equal(y[ISOLATED], 0)  # the bias starts at zero
+
+
+def test_an_isolated_receiver_can_learn_to_open_its_edges():
+    """Replacing the factors by a mask would leave it without a gradient."""
+    *_, output, m = attend(GRAPH, normalize=True)
+    slope = jax.grad(lambda graph: output(m, graph)[0][ISOLATED].sum())(GRAPH)
+    assert jnp.isfinite(slope).all()
+    assert (slope[ISOLATED] != 0).all()
+    np.testing.assert_array_equal(np.delete(slope, ISOLATED, axis=0), 0)
+
+
+def test_without_normalising_absent_edges_take_their_share():
+    _, weights, *_ = attend(GRAPH, normalize=False)
+    total = weights.sum(1)
+    np.testing.assert_allclose(total[FULL], 1, rtol=1e-6)
+    assert (total[np.array([0, 3])] < 1).all()
+
+
+@pytest.mark.parametrize(("self_loop", "diagonal"), [("removed", 0), ("forced", 1)])
+def test_the_diagonal_is_as_set(self_loop, diagonal):
+    _, weights, *_ = attend(GRAPH, self_loop=self_loop)
+    present = np.array(GRAPH)
+    np.fill_diagonal(present, diagonal)
+    np.testing.assert_array_equal(weights > 0, np.repeat(present[..., None] > 0, HEADS, axis=-1))
+
+
+def test_no_graph_is_the_complete_graph():
+    y, weights, output, m = attend(None, average=True, self_loop="forced")
+    expected, expected_weights = output(m, jnp.ones_like(GRAPH))
+    np.testing.assert_array_equal(y, expected)
+    np.testing.assert_array_equal(weights, expected_weights)
+
+
+def test_heads_are_averaged_or_concatenated():
+    side_by_side, *_ = attend(GRAPH, average=False)
+    mean, *_ = attend(GRAPH, average=True)
+    assert side_by_side.shape == (AGENTS, HEADS * FEATURES)
+    np.testing.assert_allclose(
+        mean, side_by_side.reshape(AGENTS, HEADS, FEATURES).mean(1), atol=1e-6
+    )
+
+
+def test_messages_flow_along_the_edges_only():
+    *_, output, m = attend(GRAPH, normalize=True)
+    slope = jax.jacrev(lambda m: output(m, GRAPH)[0])(m)  # (N, K O, N, D)
+    hears = np.asarray(jnp.abs(slope).sum((1, 3)) > 0)
+    hears_itself_too = np.asarray(GRAPH > 0)  # a receiver's own score matters where it hears two
+    np.testing.assert_array_equal(
+        hears & ~np.eye(AGENTS, dtype=bool), hears_itself_too & ~np.eye(AGENTS, dtype=bool)
+    )
+
+
+def test_initial_weights_have_the_published_spread():
+    layer = GraphAttention(128, 8, 32)
+    weights = layer.init(jax.random.key(0), jnp.zeros((2, 128)))["params"]
+    np.testing.assert_allclose(weights["W"].std(), 0.102, rtol=0.03)
+    for vector in ("a_i", "a_j"):
+        np.testing.assert_allclose(weights[vector].std(), 0.316, rtol=0.15)
+    np.testing.assert_array_equal(weights["bias"], 0)
+
+
+@pytest.fixture(scope="module")
+def relation():
+    """Receivers (3, K, O), messages (3, K, O) and the two attention vectors."""
+    keys = jax.random.split(jax.random.key(0), 4)
+    shapes = [(3, HEADS, FEATURES)] * 2 + [(HEADS, FEATURES)] * 2
+    return [jax.random.normal(key, shape) for key, shape in zip(keys, shapes, strict=True)]
+
+
+def test_a_relation_weighs_its_senders_by_a_softmax(relation):
+    receivers, messages, dst, src = relation
+    heard, weights = relation_attention(*relation)
+    scores = (receivers * dst).sum(-1)[:, None] + (messages * src).sum(-1)[None]
+    scores = np.where(scores > 0, scores, 0.2 * scores)
+    expected = np.exp(scores) / np.exp(scores).sum(1, keepdims=True)
+    np.testing.assert_allclose(weights, expected, rtol=1e-5)
+    np.testing.assert_allclose(heard, np.einsum("jik,iko->jko", expected, messages), rtol=1e-4)
+
+
+def test_a_relation_within_a_class_has_no_self_edge(relation):
+    _, weights = relation_attention(*relation, exclude_self=True)
+    np.testing.assert_array_equal(weights[np.arange(3), np.arange(3)], 0)
+    np.testing.assert_allclose(weights.sum(1), 1, rtol=1e-6)
+
+
+def test_a_single_sender_is_heard_in_full(relation):
+    receivers, messages, dst, src = relation
+    heard, _ = relation_attention(receivers, messages[:1], dst, src)
+    np.testing.assert_allclose(heard, jnp.broadcast_to(messages[:1], heard.shape), rtol=1e-6)
