@@ -1,4 +1,4 @@
-"""The experiments are programs, not a package: their folder is what `python experiments/x.py` sees."""
+"""The experiments are programs, not a package: their own folder is on their path."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a person can get wrong on the command line: one sentence, exit status 2, nothing left behind."""
+"""What a person can get wrong on the command line: one sentence, status 2, nothing left behind."""
 
 import sys
 
@@ -13,7 +13,10 @@ BAD = {
     "too many agents": (["--source.num-predators", "30"], "30 agents and a prey need 31 distinct"),
     "no agents": (["--source.num-predators", "0"], "the team is empty"),
     "negative epochs": (["--source-epochs", "-1"], "source-epochs must be at least 1, got -1"),
-    "negative target epochs": (["--target-epochs", "-3"], "target-epochs must be at least 0, got -3"),
+    "negative target epochs": (
+        ["--target-epochs", "-3"],
+        "target-epochs must be at least 0, got -3",
+    ),
     "unknown policy": (["--policy", "nope"], "policy 'nope' is unknown; choose one of ic3net"),
     "unknown preset": (["--preset", "nope"], "preset 'nope' is unknown; choose one of fast, paper"),
     "unknown option": (["--spam", "3"], "Unrecognized options: --spam"),
@@ -31,7 +34,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("arguments, sentence", BAD.values(), ids=BAD)
+@pytest.mark.parametrize(("arguments", "sentence"), BAD.values(), ids=BAD)
 def test_a_mistake_gets_one_sentence(arguments, sentence, tmp_path, monkeypatch, capsys):
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "notes.txt").write_text("mine")
