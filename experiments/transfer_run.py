@@ -464,7 +464,7 @@ def run_experiment(config: TransferConfig) -> dict[str, Any]:
 
 
 def table(run: Run, summary: dict[str, Any]) -> list[dict[str, Any]]:
-    """The closing table: a row per arm and reference, figures per seed."""
+    """The closing table: a row per arm and reference: steps taken and success, over the seeds."""
     grid = {
         "source": "x".join(map(str, run.config.source.shape)),
         "target": "x".join(map(str, run.config.target.shape)),
@@ -489,14 +489,20 @@ def table(run: Run, summary: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _row(name: str, task: str, evaluation: dict[str, Any], **cost: Any) -> dict[str, Any]:
-    sampled, greedy = evaluation.get("sampled", {}), evaluation.get("greedy", {})
+    sampled = evaluation.get("sampled", {})
+    steps = np.atleast_1d(sampled.get("steps_taken", []))
     return {
-        "policy": name,
-        "grid": task,
-        "steps": sampled.get("steps_taken"),
-        "success": sampled.get("success"),
-        "greedy": greedy.get("steps_taken"),
-        "(success)": greedy.get("success"),
+        "policy": f"{name} {task}",
+        "sampled": _steps(sampled),
+        "seeds": f"{steps.min():.2f}-{steps.max():.2f}" if steps.size > 1 else None,
+        "greedy": _steps(evaluation.get("greedy", {})),
         "M steps": cost.get("M steps"),
-        "s": cost.get("seconds"),
+        "seconds": cost.get("seconds"),
     }
+
+
+def _steps(evaluation: dict[str, Any]) -> str | None:
+    """Mean steps taken and success over the seeds."""
+    if not evaluation:
+        return None
+    return f"{np.mean(evaluation['steps_taken']):.2f} {np.mean(evaluation['success']):7.1%}"
