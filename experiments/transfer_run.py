@@ -472,7 +472,7 @@ def table(run: Run, summary: dict[str, Any]) -> list[dict[str, Any]]:
     rows = []
     for arm, result in summary["arms"].items():
         task = grid["source" if arm == SOURCE else "target"]
-        cost = {"M steps": result["env_steps"] / 1e6, "seconds": result["train_seconds"]}
+        cost = {"steps": result["env_steps"], "seconds": result["train_seconds"]}
         rows.append(_row(arm, task, result["evaluation"], **cost))
         if arm == SOURCE and summary["zero_shot"]:
             evaluation = {"sampled": summary["zero_shot"], "greedy": summary["zero_shot_greedy"]}
@@ -494,10 +494,9 @@ def _row(name: str, task: str, evaluation: dict[str, Any], **cost: Any) -> dict[
     return {
         "policy": f"{name} {task}",
         "sampled": _steps(sampled),
-        "seeds": f"{steps.min():.2f}-{steps.max():.2f}" if steps.size > 1 else None,
+        "seeds": f"{steps.min():.1f}-{steps.max():.1f}" if steps.size > 1 else None,
         "greedy": _steps(evaluation.get("greedy", {})),
-        "M steps": cost.get("M steps"),
-        "seconds": cost.get("seconds"),
+        "cost": f"{cost['steps'] / 1e6:.1f} M, {cost['seconds']:.0f} s" if cost else None,
     }
 
 
@@ -505,4 +504,4 @@ def _steps(evaluation: dict[str, Any]) -> str | None:
     """Mean steps taken and success over the seeds."""
     if not evaluation:
         return None
-    return f"{np.mean(evaluation['steps_taken']):.2f} {np.mean(evaluation['success']):7.1%}"
+    return f"{np.mean(evaluation['steps_taken']):.2f} {np.mean(evaluation['success']):6.1%}"
