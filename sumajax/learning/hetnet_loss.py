@@ -36,7 +36,7 @@ def hetnet(
     """
     peers = same_class(trajectory.agent_class)
     size, episodes = peers.sum(0), (trajectory.last & valid).sum(0)[:, None]  # (N,), (E, 1)
-    weight = jnp.broadcast_to(valid[..., None], trajectory.value.shape).astype(jnp.float32)
+    weight = jnp.where(valid[..., None], jnp.ones_like(trajectory.value), 0)
     raw = estimate_advantages(trajectory, last_value, config)
     advantages = normalise_by_class(raw, valid, episodes * trajectory.max_steps, peers)
     policy, entropy, _ = policy_gradient(trajectory.decisions, advantages, weight / episodes)
@@ -76,7 +76,7 @@ def normalise_by_class(
 def same_class(agent_class: tuple[int, ...]) -> np.ndarray:
     """(N, N) 1 where two agents are of one class."""
     classes = np.array(agent_class)
-    return (classes[:, None] == classes).astype(np.float32)
+    return (classes[:, None] == classes).astype(float)
 
 
 def episode_length(trajectory: Trajectory) -> chex.Array:
