@@ -227,7 +227,7 @@ def _draw_bounds(axes: Axes, bounds: Mapping[str, float], named: bool) -> None:
         for name, value in bounds.items()
     }
     texts = {
-        name: "\n".join(textwrap.wrap(f"{name} {value:g}", 18)) for name, value in bounds.items()
+        name: "\n".join(textwrap.wrap(f"{name} {value:.4g}", 18)) for name, value in bounds.items()
     }
     for name, height in apart(wanted, {k: 0.055 * (t.count("\n") + 1) for k, t in texts.items()}):
         axes.annotate(
@@ -280,6 +280,8 @@ def _note(curves: Mapping[str, Curve]) -> str:
     seeds = max(curve.num_seeds for curve in curves.values())
     few = {1: "one seed", 2: "mean of two seeds, band: both"}
     note = few.get(seeds, f"median of {seeds} seeds, band: quartiles")
-    if "transfer" in curves and curves["transfer"].shift > 0:
-        note += "; the transferred policy starts at the cost of its source training"
-    return note
+    if "transfer" not in curves:
+        return note
+    if curves["transfer"].shift > 0:
+        return f"{note}; the transferred policy starts at the cost of its source training"
+    return f"{note}; what the source training cost is not counted"

@@ -124,7 +124,7 @@ def record_episode(
         raise ValueError(
             f"a replay needs agents and prey on a grid; {type(task).__name__} has not."
         )
-    first, steps = _run(env, policy, greedy, params, key)
+    first, steps = _run(env, policy, params, key, greedy)
     steps = jax.device_get(steps)
     length = int(np.argmax(steps["ended"])) + 1 if steps["ended"].any() else len(steps["ended"])
 
@@ -148,16 +148,15 @@ def record_episode(
     )
 
 
-@partial(jax.jit, static_argnames=("env", "policy", "greedy"))
+@partial(jax.jit, static_argnames=("env", "policy"))
 def _run(
-    env: Environment, policy: Policy, greedy: bool, params: Any, key: chex.PRNGKey
+    env: Environment, policy: Policy, params: Any, key: chex.PRNGKey, greedy: chex.Array
 ) -> tuple[Any, dict[str, chex.Array]]:
     """The first state, and `max_steps` steps from it; what follows the end is cut off later."""
     reset_key, noise_key = jax.random.split(key)
     first = env.reset(reset_key)
     noise = policy.sample_noise(noise_key, (env.max_steps,))
-    if greedy:
-        noise = jax.tree.map(jnp.zeros_like, noise)
+    noise = jax.tree.map(lambda numbers: jnp.where(greedy, 0, numbers), noise)
 
     def step(loop: tuple[Any, Any], noise_t: Any) -> tuple[tuple[Any, Any], dict[str, chex.Array]]:
         state, carry = loop
@@ -362,7 +361,7 @@ def _palette(images: Sequence[Image.Image]) -> Image.Image:
         sheet.paste(image, (0, index * image.height))
     palette = sheet.quantize(255, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     colours = np.array(palette.getpalette(), np.uint8).reshape(-1, 3)
-    colours[colours.astype(int).sum(-1).argmax()] = 255  # the cut averages white with its shades
+    colours[(colours >= 248).all(-1)] = 255  # the cut drops low bits, and white would turn grey
     palette.putpalette(colours.ravel().tolist())
     return palette
 

@@ -105,6 +105,7 @@ def test_arms_may_be_missing():
     assert list(lines(figure.axes[0])) == ["source task", "target, after transfer"]
     rows = run(arms=("transfer",))
     assert arm_curves(rows, "env_steps", "steps_taken")["transfer"].x[0] == 20_000
+    assert "not counted" in learning_curves(rows).get_supxlabel()
     cost = {"env_steps": 7_000.0}
     assert arm_curves(rows, "env_steps", "steps_taken", cost)["transfer"].x[0] == 27_000
 

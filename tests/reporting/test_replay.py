@@ -1,6 +1,7 @@
 import sys
 
 import jax
+import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
@@ -9,16 +10,16 @@ from PIL import Image
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.environments.grid import move
-from sumajax.policies import make_policy
+from sumajax.policies import Policy, PolicyModule, PolicyOutput, TeamSpec, make_policy
+from sumajax.policies.types import decide
 from sumajax.reporting import Episode, record_episode, write_gif, write_strip
 from sumajax.reporting import replay as module
 from sumajax.upsampling import StateUpsampled
 
-SMALL = {"hidden": 8}
 
-
-def episode(steps=3, agents=3, **changes):
+def episode(steps=3, size=(5, 6), **changes):
     """A capture agent (the last) and predators that stand still; 0 and 1 talk to each other."""
+    agents = 3
     attention = np.zeros((steps, agents, agents))
     attention[:, 0, 1] = attention[:, 1, 0] = 0.5
     communication = np.zeros((steps, agents))
@@ -36,7 +37,7 @@ def episode(steps=3, agents=3, **changes):
         "communication": communication,
         "reward": np.zeros((steps, agents)),
         "agent_class": agent_class,
-        "size": (5, 6),
+        "size": size,
         "vision": 1,
     }
     return Episode(**{**fields, **changes})
@@ -49,9 +50,9 @@ def gids(shown, moment):
 
 @pytest.fixture(scope="module")
 def recorded():
-    env = StateUpsampled(PredatorPrey(size=3, num_predators=2, max_steps=7), 6)
-    policy = make_policy("ic3net", env, **SMALL)
-    params = policy.init(jax.random.key(0))
+    env = StateUpsampled(PredatorPrey(size=3, num_predators=2, max_steps=30), 6)
+    policy = make_policy("ic3net", env, hidden=8)
+    params = jax.jit(policy.init)(jax.random.key(0))
     return env.env, [
         record_episode(env, policy, params, jax.random.key(seed)) for seed in range(6)
     ], record_episode(env, policy, params, jax.random.key(0), greedy=True)  # fmt: skip
@@ -62,9 +63,9 @@ def test_a_recorded_episode_obeys_the_rules_of_the_task(recorded):
     assert len({shown.num_steps for shown in episodes}) > 1  # some end before the limit
     for shown in [*episodes, greedy]:
         assert shown.size == (3, 3)
-        assert shown.num_steps <= 7
+        assert shown.num_steps <= 30
         assert shown.success == bool((shown.agents[-1] == shown.prey).all())
-        assert shown.success or shown.num_steps == 7
+        assert shown.success or shown.num_steps == 30
         assert not (shown.agents[:-1] == shown.prey).all((1, 2)).any()
         for t in range(shown.num_steps):
             moved = np.asarray(move(shown.agents[t], shown.actions[t], (3, 3)))
@@ -85,17 +86,42 @@ def test_the_gates_of_a_step_are_those_its_messages_went_through(recorded):
     np.testing.assert_array_equal(attention > 0, both > 0)
 
 
-def test_greedy_and_sampled_episodes_are_repeatable_and_differ():
-    env = PredatorCapturePrey(size=3, num_predators=1, num_capturers=1, max_steps=4)
-    policy = make_policy("commnet", env, **SMALL)
-    params = policy.init(jax.random.key(0))
-    key = jax.random.key(1)
-    runs = [record_episode(env, policy, params, key, greedy) for greedy in (True, True, False)]
-    np.testing.assert_array_equal(runs[0].actions, runs[1].actions)
-    assert runs[0].actions.tolist() != runs[2].actions.tolist()
-    assert runs[0].agent_class.tolist() == [0, 1]
-    assert runs[0].captured[:, 0].all()
-    assert runs[0].communication.all()
+class AnyAction(PolicyModule):
+    """Likes every action alike, stay (the first class) or capture (the second) a little more."""
+
+    def encode_states(self, states):
+        return jnp.zeros((states.shape[0], 1))
+
+    def __call__(self, carry, state_features, view, noise):
+        favourite = jnp.where(jnp.asarray(self.team.agent_class) == 0, 4, 5)
+        decision = decide(jax.nn.one_hot(favourite, self.team.num_actions), noise)
+        share = jnp.full(self.team.num_agents, 0.25)
+        return carry, PolicyOutput({"action": decision}, share, share, jnp.eye(2))
+
+    def initial_carry(self, batch_shape):
+        return ()
+
+    def sample_noise(self, key, batch_shape):
+        shape = (*batch_shape, self.team.num_agents, self.team.num_actions)
+        return jax.random.gumbel(key, shape)
+
+
+def test_greedy_takes_the_likeliest_choice_and_a_key_gives_one_episode():
+    env = PredatorCapturePrey(
+        size=3, num_predators=1, num_capturers=1, max_steps=6, capture_vision=0
+    )
+    policy = Policy("any", AnyAction(TeamSpec.of(env)))
+    first, again, greedy = (
+        record_episode(env, policy, {}, jax.random.key(1), greedy)
+        for greedy in (False, False, True)
+    )
+    np.testing.assert_array_equal(first.actions, again.actions)
+    assert greedy.actions.tolist() == [[4, 5]] * 6
+    assert first.actions.tolist() != greedy.actions.tolist()
+    assert greedy.agent_class.tolist() == [0, 1]
+    assert greedy.captured.tolist() == [[True, False]] * 7
+    assert (first.communication == 0.25).all()
+    assert (first.vision, first.capture_vision, first.success) == (1, 0, False)
 
 
 def test_a_task_without_agents_on_a_grid_is_refused():
