@@ -310,7 +310,7 @@ class TestMistakes:
 
 
 class TestReferenceLevels:
-    """As for Predator-Prey; capture agents choose among six actions, a shortest path has one more."""
+    """As for Predator-Prey; capture agents choose among six actions and need one step more."""
 
     @pytest.mark.parametrize(
         ("team", "limit", "steps", "error", "success"),
