@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sumajax.environments import Environment, PredatorCapturePrey, PredatorPrey
 from sumajax.upsampling import StateUpsampled, upsample
 
-factors = st.integers(1, 4)
+factors = st.integers(1, 3)
 
 
 def states(rows: int, columns: int) -> np.ndarray:
@@ -35,7 +35,7 @@ class TestUpsample:
         large = upsample(jnp.array([[1.0, 2.0], [3.0, 4.0]]), (1, 3))
         assert large.tolist() == [[1, 1, 1, 2, 2, 2], [3, 3, 3, 4, 4, 4]]
 
-    @settings(deadline=None, max_examples=25)
+    @settings(deadline=None, max_examples=9)
     @given(down=factors, right=factors)
     def test_the_block_mean_takes_it_back(self, down, right):
         small = states(3, 2)
@@ -43,7 +43,7 @@ class TestUpsample:
         assert large.shape == (2, 1, 3 * down, 2 * right)
         np.testing.assert_allclose(block_mean(large, down, right), small)
 
-    @settings(deadline=None, max_examples=10)
+    @settings(deadline=None, max_examples=3)
     @given(factor=factors)
     def test_the_mass_grows_with_the_square_of_the_factor(self, factor):
         one_hot = np.zeros((3, 3), np.float32)
@@ -53,7 +53,7 @@ class TestUpsample:
     def test_the_factor_one_is_the_identity(self):
         np.testing.assert_array_equal(upsample(states(3, 2), 1), states(3, 2))
 
-    @settings(deadline=None, max_examples=10)
+    @settings(deadline=None, max_examples=6)
     @given(first=factors, second=factors)
     def test_two_steps_are_one_by_the_product(self, first, second):
         twice = upsample(upsample(states(2, 3), first), second)
