@@ -49,7 +49,8 @@ class TestPlaceDistinct:
 
     def test_each_order_of_a_full_grid_is_equally_likely(self):
         cells = place_many(4, (2, 2), DRAWS)
-        _, counts = np.unique(cells, axis=0, return_counts=True)
+        counts = np.bincount(cells @ [64, 16, 4, 1])
+        counts = counts[counts > 0]
         assert len(counts) == 24
         assert chisquare(counts).pvalue > 1e-3
 
