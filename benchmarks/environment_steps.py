@@ -153,10 +153,10 @@ def measure(env: Environment, options: Options, num_envs: int) -> Result:
     states, _ = jax.block_until_ready(rollout(states, key))
     steps = num_envs * options.steps
     per_cpu_second, per_second = [], []
-    for repeat in range(options.repeats):
+    for repeat_key in list(jax.random.split(key, options.repeats)):
         cpu, wall, calls = time.process_time(), time.perf_counter(), 0
         while calls == 0 or time.process_time() - cpu < options.seconds:
-            states, _ = jax.block_until_ready(rollout(states, jax.random.fold_in(key, repeat)))
+            states, _ = jax.block_until_ready(rollout(states, repeat_key))
             calls += 1
         per_cpu_second.append(calls * steps / (time.process_time() - cpu))
         per_second.append(calls * steps / (time.perf_counter() - wall))
