@@ -125,16 +125,32 @@ def preset(name: str, policy: str = "ic3net", **changes: Any) -> LearnerConfig:
     """The settings of preset `name` for a policy, with `changes`.
 
     Raises:
-      ValueError: for an unknown preset or setting.
+      ValueError: for an unknown preset or setting, or preset `paper` of an unpublished policy.
     """
     if name not in PRESETS:
         raise ValueError(f"preset {name!r} is unknown; choose one of {', '.join(PRESETS)}.")
+    if name == "paper" and policy not in PRESETS[name]:
+        raise ValueError(
+            f"nothing was published about policy {policy!r}: use preset 'fast', or 'paper' with one "
+            f"of {', '.join(PRESETS[name])}."
+        )
     known = {field.name for field in fields(LearnerConfig)}
     unknown = sorted(set(changes) - known)
     if unknown:
         raise ValueError(f"the learner has no setting {unknown[0]!r}; it has {', '.join(known)}.")
     return LearnerConfig(**{**PRESETS[name].get(policy, {}), **changes})
 
+
+_OPTIONAL = ("max_grad_norm", "detach_gap")
+"""Settings that None turns off."""
+
+_LEAST: dict[str, int] = {
+    "num_envs": 1,
+    "rollout_length": 1,
+    "warmup_epochs": 0,
+    "anneal_epochs": 0,
+    "detach_gap": 1,
+}
 
 _RANGES: dict[str, tuple[float, float]] = {
     "gamma": (0.0, 1.0),
@@ -148,13 +164,9 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 
 def _validate(config: LearnerConfig) -> None:
-    for name, least in (
-        ("num_envs", 1),
-        ("rollout_length", 1),
-        ("warmup_epochs", 0),
-        ("anneal_epochs", 0),
-    ):
-        value = getattr(config, name)
+    given = {k: v for k, v in vars(config).items() if v is not None or k not in _OPTIONAL}
+    for name, least in _LEAST.items():
+        value = given.get(name, least)
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
     for name, (low, high) in _RANGES.items():
@@ -162,9 +174,9 @@ def _validate(config: LearnerConfig) -> None:
             raise ValueError(
                 f"{name} must lie between {low:g} and {high:g}, got {getattr(config, name)!r}."
             )
-    for name in ("learning_rate", "max_grad_norm", "detach_gap"):
-        value = getattr(config, name)
-        if value is not None and not 0 < value < float("inf"):
+    for name in ("learning_rate", "max_grad_norm"):
+        value = given.get(name, 1.0)
+        if value is None or not 0 < value < float("inf"):
             raise ValueError(f"{name} must be greater than 0, got {value!r}.")
     for name, choices in (("optimiser", Optimiser), ("loss", Loss)):
         if getattr(config, name) not in get_args(choices):
@@ -198,7 +210,7 @@ def _validate_hetnet(config: LearnerConfig) -> None:
 
 
 def _nearest(config: LearnerConfig) -> str:
-    """The two numbers of environments around the given one that divide an epoch."""
+    """The two numbers of environments nearest to the given one that divide an epoch."""
     fits = [n for n in range(1, EPOCH_STEPS + 1) if EPOCH_STEPS % (n * config.rollout_length) == 0]
     if not fits:
         return "a rollout_length of 20 with 50 environments"

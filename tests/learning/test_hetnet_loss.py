@@ -8,56 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import MatchView
+from trajectories import random_trajectory
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import make_learner, preset
 from sumajax.learning.hetnet_loss import episode_length, hetnet
 from sumajax.learning.learner import clip_by_global_norm
-from sumajax.learning.rollout import Trajectory
 from sumajax.policies import Decision, make_policy
 
 CLASSES = {"2P1A": (0, 0, 1), "3P2A": (0, 0, 0, 1, 1), "3P": (0, 0, 0)}
-MAX_STEPS, ACTIONS = 7, 4
+MAX_STEPS = 7
 LENGTHS = [[3, 7, 1, 5], [7, 7], [2, 6, 4]]
 """Episodes of each environment; afterwards it goes on with steps that must not count."""
 
 CONFIG = preset("paper", "hetnet")
-
-
-def random_trajectory(agent_class, rng) -> tuple[Trajectory, np.ndarray]:
-    """A trajectory of `LENGTHS` and its valid steps (T, E)."""
-    num_steps, num_envs, num_agents = max(map(sum, LENGTHS)) + 2, len(LENGTHS), len(agent_class)
-    shape = (num_steps, num_envs, num_agents)
-    steps_taken, last = np.ones((2, *shape[:2]), int)
-    valid = np.zeros(shape[:2], bool)
-    last[:] = 0
-    for env, lengths in enumerate(LENGTHS):
-        counted = np.concatenate([np.arange(1, n + 1) for n in lengths])
-        steps_taken[: len(counted), env] = counted
-        last[np.cumsum(lengths) - 1, env] = 1
-        valid[: len(counted), env] = True
-    by_class = rng.normal(size=(*shape[:2], max(agent_class) + 1))
-    truncated = (last == 1) & (steps_taken == MAX_STEPS)
-    trajectory = Trajectory(
-        decisions={
-            "action": Decision(
-                jnp.asarray(rng.normal(size=(*shape, ACTIONS))),
-                jnp.asarray(rng.integers(ACTIONS, size=shape)),
-            )
-        },
-        value=jnp.asarray(by_class[..., list(agent_class)]),
-        communication=jnp.ones(shape),
-        active=jnp.ones(shape, bool),
-        reward=jnp.asarray(rng.normal(size=shape)),
-        terminated=jnp.asarray((last == 1) & ~truncated),
-        truncated=jnp.asarray(truncated),
-        success=jnp.asarray((last == 1) & ~truncated),
-        steps_taken=jnp.asarray(steps_taken),
-        episode_return=jnp.zeros(shape),
-        agent_class=tuple(agent_class),
-        max_steps=MAX_STEPS,
-    )
-    return trajectory, valid
 
 
 def slow_advantages(reward, value, gamma, lambda_):
@@ -119,7 +83,7 @@ def slow_loss(trajectory, logits, value, constant):
 def test_loss_and_its_gradient(agent_class):
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
-        trajectory, valid = random_trajectory(agent_class, rng)
+        trajectory, valid = random_trajectory(rng, LENGTHS, agent_class, max_steps=MAX_STEPS)
         choice = trajectory.decisions["action"].choice
         # What follows the last episode must not matter, nor a value beyond the last step.
         beyond = jnp.full(trajectory.value.shape[1:], 1e3)
@@ -146,7 +110,7 @@ def test_loss_and_its_gradient(agent_class):
 
 
 def test_length_of_the_episode_of_each_step():
-    trajectory, valid = random_trajectory((0, 0), np.random.default_rng(0))
+    trajectory, valid = random_trajectory(np.random.default_rng(0), LENGTHS)
     lengths = np.asarray(episode_length(trajectory))
     for env, expected in enumerate(LENGTHS):
         np.testing.assert_array_equal(lengths[valid[:, env], env], np.repeat(expected, expected))
