@@ -131,8 +131,8 @@ def preset(name: str, policy: str = "ic3net", **changes: Any) -> LearnerConfig:
         raise ValueError(f"preset {name!r} is unknown; choose one of {', '.join(PRESETS)}.")
     if name == "paper" and policy not in PRESETS[name]:
         raise ValueError(
-            f"nothing was published about policy {policy!r}: use preset 'fast', or 'paper' with one "
-            f"of {', '.join(PRESETS[name])}."
+            f"nothing was published about policy {policy!r}: use preset 'fast', "
+            f"or 'paper' with one of {', '.join(PRESETS[name])}."
         )
     known = {field.name for field in fields(LearnerConfig)}
     unknown = sorted(set(changes) - known)

@@ -51,7 +51,7 @@ def random_trajectory(
         end = sum(of_env)
         counted = [np.arange(1, n + 1) for n in (*of_env, num_steps - end)]
         steps_taken[:, env] = np.concatenate(counted)
-        last[np.cumsum(of_env) - 1, env] = True
+        last[np.cumsum(of_env, dtype=int) - 1, env] = True
         valid[:end, env] = True
     truncated = last & (steps_taken == max_steps)
     by_class = rng.normal(size=(*shape[:2], max(agent_class) + 1))
