@@ -285,7 +285,9 @@ def print_table(
     if file.isatty():
         Console(file=file).print(result_table(rows, title))
         return
-    console = Console(file=file, width=WIDTH, color_system=None, force_terminal=False)
+    console = Console(
+        file=file, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False
+    )
     with console.capture() as captured:
         console.print(result_table(rows, title))
     lines = [line.rstrip() for line in captured.get().splitlines()]
