@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from sumajax.environments.grid import grid_size
+from sumajax.environments.grid import grid_size, plain_size
 from sumajax.environments.types import Environment, Observation, Transition
 
 Scale = Literal["none", "mass"]
@@ -21,11 +21,12 @@ def upsample(state: chex.Array, factor: int | tuple[int, int]) -> chex.Array:
       state: (..., rows, columns).
       factor: f >= 1 for both axes, or (row factor, column factor).
 
+    Raises:
+      ValueError: when the factor is not one or two positive whole numbers.
+
     Source: paper section IV-A, the operator phi.
     """
-    down, right = (factor, factor) if isinstance(factor, int) else factor
-    if min(down, right) < 1:
-        raise ValueError(f"the upsampling factor must be at least 1, got {factor}.")
+    down, right = grid_size(factor, name="the upsampling factor")
     return jnp.repeat(jnp.repeat(state, down, axis=-2), right, axis=-1)
 
 
@@ -38,7 +39,7 @@ class StateUpsampled:
     the paper, each of its cells holds that value.
 
     Raises:
-      ValueError: when `size` is not a whole multiple of the grid of `env`.
+      ValueError: when `size` is no size, or no whole multiple of the grid of `env`.
     """
 
     env: Environment
@@ -46,15 +47,14 @@ class StateUpsampled:
     scale: Scale = "none"
 
     def __post_init__(self) -> None:
-        if isinstance(self.size, list):
-            object.__setattr__(self, "size", tuple(self.size))
+        object.__setattr__(self, "size", plain_size(self.size))
         if self.scale not in get_args(Scale):
             raise ValueError(
                 f"scale {self.scale!r} is unknown; choose one of {', '.join(get_args(Scale))}."
             )
         rows, columns = grid_size(self.size)
         source_rows, source_columns = self.env.state_shape[1:]
-        if min(rows, columns) < 1 or rows % source_rows or columns % source_columns:
+        if rows % source_rows or columns % source_columns:
             raise ValueError(
                 f"the target size {rows}x{columns} is not a whole multiple of the source size "
                 f"{source_rows}x{source_columns}; choose sides that divide."

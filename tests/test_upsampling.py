@@ -59,9 +59,11 @@ class TestUpsample:
         twice = upsample(upsample(states(2, 3), first), second)
         np.testing.assert_array_equal(twice, upsample(states(2, 3), first * second))
 
-    @pytest.mark.parametrize("factor", [0, -1, (2, 0)])
-    def test_a_factor_below_one_is_refused(self, factor):
-        sentence = f"the upsampling factor must be at least 1, got {factor}."
+    @pytest.mark.parametrize("factor", [0, -1, (2, 0), 1.5, (2,)])
+    def test_a_factor_that_is_no_positive_whole_number_is_refused(self, factor):
+        sentence = (
+            f"the upsampling factor must be a positive int or (rows, columns), got {factor!r}."
+        )
         with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
             upsample(states(2, 2), factor)
 
@@ -142,14 +144,18 @@ class TestStateUpsampled:
         at_once = StateUpsampled(env, size=12)
         np.testing.assert_array_equal(in_two.observe(state).state, at_once.observe(state).state)
 
-    @pytest.mark.parametrize(
-        ("size", "named"), [(12, "12x12"), (3, "3x3"), ((10, 7), "10x7"), (0, "0x0"), (-5, "-5x-5")]
-    )
+    @pytest.mark.parametrize(("size", "named"), [(12, "12x12"), (3, "3x3"), ((10, 7), "10x7")])
     def test_a_size_that_is_no_multiple_is_refused_naming_both(self, size, named):
         sentence = (
             f"the target size {named} is not a whole multiple of the source size 5x5; "
             "choose sides that divide."
         )
+        with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
+            StateUpsampled(PredatorPrey(size=5), size=size)
+
+    @pytest.mark.parametrize("size", [0, 7.5, (10,)])
+    def test_what_is_no_size_is_refused(self, size):
+        sentence = f"size must be a positive int or (rows, columns), got {size!r}."
         with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
             StateUpsampled(PredatorPrey(size=5), size=size)
 

@@ -19,9 +19,23 @@ NOWHERE = -(2**14)
 """Row and column of a cell that no window reaches, to fill up a list of entities."""
 
 
-def grid_size(size: int | tuple[int, int]) -> tuple[int, int]:
-    """`size` as (rows, columns): an int is the side of a square grid."""
-    return (size, size) if isinstance(size, int) else (size[0], size[1])
+def grid_size(size: int | tuple[int, int], name: str = "size") -> tuple[int, int]:
+    """`size` as (rows, columns): one number is the side of a square grid.
+
+    Raises:
+      ValueError: for anything but one or two positive whole numbers.
+    """
+    sides = tuple(size) if isinstance(size, (tuple, list)) else (size, size)
+    whole = all(isinstance(s, (int, np.integer)) and not isinstance(s, bool) for s in sides)
+    if not whole or len(sides) != 2 or min(sides) < 1:
+        raise ValueError(f"{name} must be a positive int or (rows, columns), got {size!r}.")
+    return int(sides[0]), int(sides[1])
+
+
+def plain_size(size: int | tuple[int, int]) -> int | tuple[int, int]:
+    """A checked size that compares, hashes and prints alike, whichever kind of numbers it had."""
+    rows, columns = grid_size(size)
+    return (rows, columns) if isinstance(size, (tuple, list)) else rows
 
 
 def place_distinct(key: chex.PRNGKey, count: int, size: tuple[int, int]) -> chex.Array:
@@ -122,6 +136,6 @@ _ROW = 2**16
 def _number(cell: chex.Array) -> chex.Array:
     """(...,) int32 that differ where the (..., 2) cells do, also those outside the grid.
 
-    Sums of numbers are numbers of sums, as long as sides stay below 2**14.
+    The number of a sum is the sum of the numbers, as long as sides stay below 2**14.
     """
     return cell[..., 0] * _ROW + cell[..., 1]

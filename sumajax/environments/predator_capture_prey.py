@@ -77,8 +77,7 @@ class PredatorCapturePrey:
     num_actions: ClassVar[int] = 6
 
     def __post_init__(self) -> None:
-        if isinstance(self.size, list):
-            object.__setattr__(self, "size", tuple(self.size))
+        object.__setattr__(self, "size", grid.plain_size(self.size))
         _validate(self)
 
     @property
@@ -187,7 +186,7 @@ def step(env: PredatorCapturePrey, state: State, actions: chex.Array) -> tuple[S
         value out of range is a stay.
 
     Raises:
-      ValueError: for a concrete action out of range or a wrong shape.
+      ValueError: for a concrete action out of range, a wrong shape or no whole numbers.
     """
     actions = _checked_actions(env, actions)
     can_capture = jnp.asarray(env.agent_class == CAPTURER)
@@ -295,6 +294,8 @@ def _checked_actions(env: PredatorCapturePrey, actions: chex.Array) -> chex.Arra
         raise ValueError(
             f"step needs one action per agent, shape ({env.num_agents},), got {actions.shape}."
         )
+    if not jnp.issubdtype(actions.dtype, jnp.integer):
+        raise ValueError(f"actions are whole numbers, got an array of {actions.dtype}.")
     if not _is_traced(actions):
         wrong = (np.asarray(actions) < 0) | (np.asarray(actions) >= env.num_actions)
         if wrong.any():
@@ -306,9 +307,11 @@ def _checked_actions(env: PredatorCapturePrey, actions: chex.Array) -> chex.Arra
 
 
 def _validate(env: PredatorCapturePrey) -> None:
-    rows, columns = _checked_size(env.size)
-    for name in ("num_predators", "num_capturers", "vision", "max_steps"):
+    rows, columns = env.shape
+    for name in ("num_predators", "num_capturers", "vision", "max_steps", "capture_vision"):
         value = getattr(env, name)
+        if name == "capture_vision" and value is None:
+            continue
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise ValueError(f"{name} must be a whole number, got {value!r}.")
     least_values = {"num_predators": 0, "num_capturers": 0, "vision": 0, "max_steps": 1}
@@ -338,12 +341,3 @@ def _validate(env: PredatorCapturePrey) -> None:
             f"capture_vision {env.capture_vision} must lie between 0 and vision {env.vision}, "
             "or be None for blind capture agents."
         )
-
-
-def _checked_size(size: int | tuple[int, int]) -> tuple[int, int]:
-    sides = size if isinstance(size, tuple) else (size,)
-    integers = (int, np.integer)
-    whole = all(isinstance(side, integers) and not isinstance(side, bool) for side in sides)
-    if not whole or len(sides) > 2 or min(sides, default=0) < 1:
-        raise ValueError(f"size must be a positive int or (rows, columns), got {size!r}.")
-    return grid.grid_size(size)

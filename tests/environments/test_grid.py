@@ -1,5 +1,7 @@
 """The verbs of a grid."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -159,3 +161,11 @@ class TestWindow:
 def test_a_size_is_rows_and_columns():
     assert grid.grid_size(5) == (5, 5)
     assert grid.grid_size((3, 7)) == (3, 7)
+    assert grid.grid_size(np.int64(5)) == (5, 5)
+
+
+@pytest.mark.parametrize("size", [0, -1, (3, 0), (5,), (3, 4, 5), 2.5, (3, 2.0), True, "5", None])
+def test_anything_else_is_no_size(size):
+    sentence = f"size must be a positive int or (rows, columns), got {size!r}."
+    with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
+        grid.grid_size(size)

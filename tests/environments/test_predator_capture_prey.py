@@ -286,6 +286,7 @@ class TestMistakes:
                 {"capture_reward": "half"},
                 "capture_reward 'half' is unknown; choose one of default, second.",
             ),
+            ({"capture_vision": 0.5}, "capture_vision must be a whole number, got 0.5."),
             (
                 {"capture_vision": 2},
                 "capture_vision 2 must lie between 0 and vision 1, "
