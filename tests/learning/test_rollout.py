@@ -1,0 +1,156 @@
+"""The scan over environment and policy against a loop over both, and where gradients flow."""
+
+from dataclasses import dataclass
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from trajectories import TINY_TASK, Clock, summing_policy, tiny_learner
+
+from sumajax.environments import PredatorPrey
+from sumajax.learning.rollout import draw, last_value, rollout, start
+
+STEPS, ENVS = 12, 3  # more than two episodes of at most 5 steps
+
+
+@cache
+def scene():
+    """A tiny IC3Net, three fresh environments and all the random numbers of a rollout."""
+    learner = tiny_learner(policy="ic3net")
+    env, policy = learner.env, learner.policy
+    params = jax.jit(policy.init)(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), ENVS)
+    actors = jax.jit(partial(start, env, policy))(keys)
+    draws = jax.jit(partial(draw, env, policy), static_argnums=1)(keys, STEPS)
+    return env, policy, params, actors, draws
+
+
+@cache
+def rolled():
+    env, policy, params, actors, draws = scene()
+    return jax.jit(partial(rollout, env, policy))(params, actors, draws)
+
+
+def test_every_step_equals_one_made_by_hand():
+    """Step the task, record, and only then follow what ended by a fresh start without memory."""
+    env, policy, params, actors, draws = scene()
+    following, trajectory = rolled()
+    one_step, env_step = jax.jit(policy.apply_with), jax.jit(env.step)
+    for e in range(ENVS):
+        state = jax.tree.map(lambda x, e=e: x[e], actors.env_state)
+        carry, earned = policy.initial_carry(), np.zeros(env.num_agents)
+        for t in range(STEPS):
+            noise, fresh = jax.tree.map(lambda x, t=t, e=e: x[t, e], (draws.noise, draws.fresh))
+            seen = jax.tree.map(lambda x, t=t, e=e: x[t, e], trajectory)
+            np.testing.assert_array_equal(seen.active, env.active(state))
+            carry, output = one_step(params, carry, env.observe(state), noise)
+            state, transition = env_step(state, output.action)
+            earned = earned + transition.reward
+            np.testing.assert_array_equal(seen.decisions["action"].choice, output.action)
+            for name in ("reward", "terminated", "truncated", "success", "steps_taken"):
+                np.testing.assert_array_equal(getattr(seen, name), getattr(transition, name), name)
+            np.testing.assert_allclose(seen.value, output.value, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(seen.episode_return, earned, rtol=1e-5, atol=1e-6)
+            if transition.terminated or transition.truncated:
+                state, carry, earned = fresh, policy.initial_carry(), np.zeros(env.num_agents)
+        left = jax.tree.map(lambda x, e=e: x[e], following)
+        jax.tree.map(np.testing.assert_array_equal, left.env_state, state)
+        jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), left.carry, carry)
+        np.testing.assert_allclose(left.episode_return, earned, atol=1e-5)
+
+
+def test_memory_and_episodes_go_on_across_segments():
+    """Two rollouts, the second from where the first ended, are one rollout."""
+    env, policy, params, actors, draws = scene()
+    following, trajectory = rolled()
+    halves = [jax.tree.map(lambda x, s=s: x[s], draws) for s in np.split(np.arange(STEPS), 2)]
+    half = jax.jit(partial(rollout, env, policy))
+    middle, first = half(params, actors, halves[0])
+    end, second = half(params, middle, halves[1])
+    joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+    close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
+    jax.tree.map(close, (end, joined), (following, trajectory))
+
+
+def test_random_numbers_of_an_environment_come_from_its_own_key():
+    """So they do not change with the number of environments or with how they are spread."""
+    env, policy, *_ = scene()
+    keys = jax.random.split(jax.random.key(1), ENVS)
+    alone = draw(env, policy, keys[1:2], STEPS)
+    together = scene()[-1]
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[:, 1:2]), alone, together)
+    starts = start(env, policy, keys[1:2]), scene()[-2]
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[1:2]), *starts)
+
+
+def test_the_bootstrap_is_the_value_of_the_likeliest_next_step():
+    env, policy, params, _, _ = scene()
+    following, _ = rolled()
+    ours = jax.jit(partial(last_value, env, policy))(params, following)
+    greedy = jax.tree.map(jnp.zeros_like, policy.sample_noise(jax.random.key(0), (ENVS,)))
+    obs = jax.vmap(env.observe)(following.env_state)
+    _, output = jax.jit(policy.apply_with)(params, following.carry, obs, greedy)
+    np.testing.assert_allclose(ours, output.value, rtol=1e-5, atol=1e-6)
+
+
+def test_no_gradient_goes_through_the_bootstrap():
+    env, policy, params, _, _ = scene()
+    following, _ = rolled()
+    gradient = jax.jit(jax.grad(lambda p: last_value(env, policy, p, following).sum()))(params)
+    assert not any(leaf.any() for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.parametrize("gap", [None, 1, 2, 3, 5, 7, 100])
+def test_gradients_are_cut_where_detach_gap_says(gap):
+    """After a step whose number in its episode, from 1, the gap divides; and between episodes.
+
+    The summing policy's value after step t is the sum of its inputs x_0..x_t, so its derivative
+    with respect to x_s is 1 if step s is reached from step t and 0 if not.
+    """
+    env = Clock(max_steps=7)
+    policy, length = summing_policy(env), 7 + 3
+    actors = start(env, policy, jax.random.split(jax.random.key(0), 1))
+    draws = draw(env, policy, jax.random.split(jax.random.key(0), 1), length)
+
+    def values(x):
+        _, trajectory = rollout(env, policy, {"params": {"x": x}}, actors, draws, gap)
+        return trajectory.value[:, 0, 0]
+
+    expected = np.zeros((length, env.max_steps))
+    for t in range(length):
+        in_episode = t % env.max_steps
+        block = 0 if gap is None else in_episode // gap * gap
+        expected[t, block : in_episode + 1] = 1
+    np.testing.assert_array_equal(jax.jacobian(values)(jnp.zeros(env.max_steps)), expected)
+
+
+def test_the_gap_changes_no_value():
+    env, policy, params, actors, draws = scene()
+    cut = jax.jit(partial(rollout, env, policy, detach_gap=2))(params, actors, draws)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), cut, rolled())
+
+
+@dataclass(frozen=True)
+class Unlisted(PredatorPrey):
+    """Predator-Prey that does not say which state tensors there are."""
+
+    def state_table(self):
+        return None
+
+    def state_index(self, state):
+        raise AssertionError("there is no table to index")
+
+
+def test_states_encoded_once_or_at_every_step_give_the_same_gradients():
+    """The table is a matter of speed only."""
+    shape = {"num_envs": 4, "rollout_length": 10}
+    by_table = tiny_learner(TINY_TASK, **shape)
+    direct = tiny_learner(Unlisted(size=3, num_predators=2, max_steps=5), **shape)
+    state = jax.jit(by_table.init)(jax.random.key(0))
+    inputs = state.params, *by_table._inputs(state), state.updates
+    results = [jax.jit(learner._gradient)(*inputs) for learner in (by_table, direct)]
+    close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6)
+    jax.tree.map(close, *results)
+    assert any(np.abs(leaf).max() > 1e-3 for leaf in jax.tree.leaves(results[0][0]))
