@@ -85,17 +85,8 @@ def learning_curves(
     columns = [arm_curves(rows, name, y, source_cost) for name in panels]
     if not columns[0]:
         raise ValueError(f"there is no {y} of any arm to draw.")
-    figure = Figure(figsize=(9.0 if len(panels) > 1 else 6.0, 3.9), dpi=200, layout="constrained")
-    FigureCanvasAgg(figure)
-    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    names = {**ARM_LABELS, **(labels or {})}
-    for axes, name, curves in zip(all_axes, panels, columns, strict=True):
-        _draw_panel(axes, curves, name, names)
-    all_axes[0].set_ylabel(Y_LABELS.get(y, y.replace("_", " ")), color=INK)
-    _scale_y(all_axes[0], columns[0], y, bounds or {}, log_y)
-    for axes in all_axes:
-        _draw_bounds(axes, bounds or {}, named=axes is all_axes[-1])
-    _draw_legend(figure, all_axes[0], columns[0], title)
+    figure = _draw(panels, columns, y, bounds or {}, {**ARM_LABELS, **(labels or {})}, log_y)
+    _draw_legend(figure, columns[0], title)
     if output is not None:
         write_png(figure, output)
     return figure
@@ -152,6 +143,26 @@ def _cost(rows: Sequence[Mapping[str, Any]], x: str) -> float:
     """What the source stage cost by its end, mean over seeds; 0 without one."""
     _, values = seed_curves(rows, "source", x)
     return float(np.nanmax(values[x], axis=1).mean()) if values[x].size else 0.0
+
+
+def _draw(
+    panels: Sequence[str],
+    columns: Sequence[Mapping[str, Curve]],
+    y: str,
+    bounds: Mapping[str, float],
+    names: Mapping[str, str],
+    log_y: bool | None,
+) -> Figure:
+    figure = Figure(figsize=(9.0 if len(panels) > 1 else 6.0, 3.9), dpi=200, layout="constrained")
+    FigureCanvasAgg(figure)
+    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, name, curves in zip(all_axes, panels, columns, strict=True):
+        _draw_panel(axes, curves, name, names)
+    all_axes[0].set_ylabel(Y_LABELS.get(y, y.replace("_", " ")), color=INK)
+    _scale_y(all_axes[0], columns[0], y, bounds, log_y)
+    for axes in all_axes:
+        _draw_bounds(axes, bounds, named=axes is all_axes[-1])
+    return figure
 
 
 def _draw_panel(axes: Axes, curves: Mapping[str, Curve], x: str, names: Mapping[str, str]) -> None:
@@ -256,10 +267,8 @@ def apart(wanted: Mapping[str, float], size: Mapping[str, float]) -> list[tuple[
     return placed
 
 
-def _draw_legend(
-    figure: Figure, axes: Axes, curves: Mapping[str, Curve], title: str | None
-) -> None:
-    handles, names = axes.get_legend_handles_labels()
+def _draw_legend(figure: Figure, curves: Mapping[str, Curve], title: str | None) -> None:
+    handles, names = figure.axes[0].get_legend_handles_labels()
     figure.legend(
         handles,
         names,
