@@ -189,9 +189,8 @@ def step(env: PredatorCapturePrey, state: State, actions: chex.Array) -> tuple[S
       ValueError: for a concrete action out of range, a wrong shape or no whole numbers.
     """
     actions = _checked_actions(env, actions)
-    can_capture = jnp.asarray(env.agent_class == CAPTURER)
     was_on_prey = (state.agents == state.prey).all(-1)
-    captured = state.captured | (can_capture & was_on_prey & (actions == grid.CAPTURE))
+    captured = state.captured | (was_on_prey & (actions == grid.CAPTURE))
     moved = grid.move(state.agents, actions, env.shape)
     agents = jnp.where(state.reached[:, None], state.agents, moved)
     on_prey = (agents == state.prey).all(-1)

@@ -74,7 +74,7 @@ def configure(meta: dict[str, Any], domain: type[PredatorCapturePrey]) -> Predat
 
 @lru_cache(maxsize=64)
 def replay(path: Path, domain: type[PredatorCapturePrey]) -> Arrays:
-    """Our answer to every field of the recording, and `state_tensor`, `state_tensor_from_table`."""
+    """Our answer to every field of the recording, and some that only ours has."""
     meta, recorded = load(path)
     env = configure(meta, domain)
     states, seen, index, transition = run(env, *padded_inputs(env, recorded))
@@ -95,6 +95,7 @@ def replay(path: Path, domain: type[PredatorCapturePrey]) -> Arrays:
         "captured": states.captured[in_state][:, env.agent_class == CAPTURER],
         "ep_len": transition.steps_taken[last],
         "ep_terminated": transition.terminated[last],
+        "ep_truncated": transition.truncated[last],
         "ep_success": transition.success[last],
         "ep_return": (transition.reward * in_step[..., None]).sum(1, dtype=np.float64),
         # A transition has no other reward than that of its step.

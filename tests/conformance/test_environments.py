@@ -95,6 +95,13 @@ def test_success_is_the_completion_condition(path: Path, domain: type[PredatorCa
 
 
 @each_replay
+def test_whoever_did_not_terminate_was_cut(path: Path, domain: type[PredatorCapturePrey]):
+    _, recorded = data.load(path)
+    ours = data.replay(path, domain)
+    np.testing.assert_array_equal(ours["ep_truncated"], ~recorded["ep_terminated"])
+
+
+@each_replay
 def test_state_tensor_is_the_one_hot_of_the_own_cell(path: Path, domain: type[PredatorCapturePrey]):
     _, recorded = data.load(path)
     ours = data.replay(path, domain)
