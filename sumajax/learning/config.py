@@ -9,6 +9,7 @@ EPOCH_STEPS = 20_000
 Optimiser = Literal["adam", "rmsprop"]
 Loss = Literal["actor_critic", "hetnet"]
 Preset = Literal["fast", "paper"]
+Advantages = Literal["raw", "centred", "normalised"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class LearnerConfig:
       gamma, gae_lambda: discount and trace decay of the advantage estimates.
       bootstrap_timeouts: value an episode cut by the step limit as if it went on.
       team_reward: share of the team's mean in each agent's return, 0 to 1.
-      normalise_advantages: to mean 0, standard deviation 1 over the batch.
+      advantages: `raw`, `centred` to mean 0 over the batch, or `normalised` to standard deviation 1
+        as well.
       mask_inactive: no policy gradient for agents whose actions no longer change anything.
       loss: `actor_critic`, or `hetnet`, the per-class loss of HetNet's published program, which
         is of whole episodes only and normalises advantages in its own way.
@@ -50,7 +52,7 @@ class LearnerConfig:
     gae_lambda: float = 0.95
     bootstrap_timeouts: bool = True
     team_reward: float = 0.0
-    normalise_advantages: bool = False
+    advantages: Advantages = "raw"
     mask_inactive: bool = True
     loss: Loss = "actor_critic"
     value_weight: float = 0.5
@@ -81,7 +83,7 @@ _PUBLISHED: dict[str, Any] = {
     "gamma": 1.0,
     "gae_lambda": 1.0,
     "bootstrap_timeouts": False,
-    "normalise_advantages": False,
+    "advantages": "raw",
     "mask_inactive": False,
     "value_weight": 0.01,
     "entropy_weight": 0.0,
@@ -178,7 +180,11 @@ def _validate(config: LearnerConfig) -> None:
         value = given.get(name, 1.0)
         if value is None or not 0 < value < float("inf"):
             raise ValueError(f"{name} must be greater than 0, got {value!r}.")
-    for name, choices in (("optimiser", Optimiser), ("loss", Loss)):
+    for name, choices in (
+        ("optimiser", Optimiser),
+        ("loss", Loss),
+        ("advantages", Advantages),
+    ):
         if getattr(config, name) not in get_args(choices):
             raise ValueError(
                 f"{name} {getattr(config, name)!r} is unknown; "

@@ -44,13 +44,32 @@ def log_prob_and_entropy(decision: Decision) -> tuple[chex.Array, chex.Array]:
     return taken, entropy
 
 
+def centre(x: chex.Array, weight: chex.Array, axis: str | None = None) -> chex.Array:
+    """x with mean 0 over the entries of weight 1, of all devices."""
+    return x - _moments(x, weight, axis)[0]
+
+
 def normalise(x: chex.Array, weight: chex.Array, axis: str | None = None) -> chex.Array:
     """x with mean 0 and standard deviation 1 over the entries of weight 1, of all devices."""
+    mean, variance = _moments(x, weight, axis)
+    return (x - mean) * jax.lax.rsqrt(variance + 1e-8)
+
+
+def _moments(x: chex.Array, weight: chex.Array, axis: str | None) -> tuple[chex.Array, chex.Array]:
+    """(), () mean and variance of the entries of weight 1."""
     sums = jnp.stack([weight.sum(), (weight * x).sum(), (weight * x**2).sum()])
     count, first, second = sums if axis is None else jax.lax.psum(sums, axis)
+    count = jnp.maximum(count, 1.0)
     mean = first / count
-    variance = jnp.maximum(second / count - mean**2, 0.0)
-    return (x - mean) * jax.lax.rsqrt(variance + 1e-8)
+    return mean, jnp.maximum(second / count - mean**2, 0.0)
+
+
+ADVANTAGES: dict[str, Callable[[chex.Array, chex.Array, str | None], chex.Array]] = {
+    "raw": lambda x, weight, axis: x,
+    "centred": centre,
+    "normalised": normalise,
+}
+"""By `LearnerConfig.advantages`."""
 
 
 def policy_gradient(
@@ -112,8 +131,7 @@ def actor_critic(
     target = returns.mix_team(individual, config.team_reward)
     advantages = target - value
     acting = weight * trajectory.active if config.mask_inactive else weight
-    if config.normalise_advantages:
-        advantages = normalise(advantages, acting, axis)
+    advantages = ADVANTAGES[config.advantages](advantages, acting, axis)
     policy, entropy, action_entropy = policy_gradient(trajectory.decisions, advantages, acting)
     critic = (weight * (trajectory.value - target) ** 2).sum()
     loss = (

@@ -18,7 +18,7 @@ PUBLISHED = {
     "gae_lambda": 1.0,
     "bootstrap_timeouts": False,
     "team_reward": 0.0,
-    "normalise_advantages": False,
+    "advantages": "raw",
     "mask_inactive": False,
     "loss": "actor_critic",
     "value_weight": 0.01,

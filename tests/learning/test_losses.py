@@ -14,15 +14,14 @@ from sumajax.policies.types import MASKED_LOGIT
 
 LENGTHS = [[3, 7], [7, 2]]
 """Episodes of two environments; those of 7 steps hit the limit."""
-PLAIN = LearnerConfig(
-    normalise_advantages=False, mask_inactive=False, team_reward=0.0, entropy_weight=0.0
-)
+PLAIN = LearnerConfig(advantages="raw", mask_inactive=False, team_reward=0.0, entropy_weight=0.0)
 CONFIGS = {
     "plain": PLAIN,
     "discounted to the limit": replace(PLAIN, bootstrap_timeouts=False, gamma=0.9, gae_lambda=0.5),
     "the team's mean": replace(PLAIN, team_reward=0.25),
     "agents that are done do not act": replace(PLAIN, mask_inactive=True),
-    "normalised": replace(PLAIN, normalise_advantages=True, mask_inactive=True),
+    "centred": replace(PLAIN, advantages="centred", mask_inactive=True),
+    "normalised": replace(PLAIN, advantages="normalised", mask_inactive=True),
     "entropy bonus": replace(PLAIN, entropy_weight=0.1),
 }
 ENTROPY_SCALE = 0.5
@@ -56,8 +55,10 @@ def slow_loss(trajectory, valid, last_value, config, logits, value):
     counts = np.broadcast_to(valid[..., None], value.shape)
     acts = counts & np.asarray(trajectory.active) if config.mask_inactive else counts
     advantages = target - constant
-    if config.normalise_advantages:
-        advantages = (advantages - advantages[acts].mean()) / advantages[acts].std()
+    if config.advantages != "raw":
+        advantages = advantages - advantages[acts].mean()
+    if config.advantages == "normalised":
+        advantages = advantages / advantages[acts].std()
     policy = entropy = 0.0
     for name, decision in trajectory.decisions.items():
         log_prob = log_softmax(logits[name])

@@ -30,7 +30,7 @@ def difference(a, b):
 
 
 def compare():
-    learner = tiny_learner(TINY_TASK, num_envs=200, rollout_length=20, normalise_advantages=True)
+    learner = tiny_learner(TINY_TASK, num_envs=200, rollout_length=20, advantages="normalised")
     together, _ = trained(learner, SEEDS, 1)
     over_seeds, seeds_mesh = trained(learner, SEEDS, 2)
     over_envs, envs_mesh = trained(learner, SEEDS[:1], 2)
