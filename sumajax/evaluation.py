@@ -81,9 +81,9 @@ def evaluate_random(
 def shortest_path_steps(env: Environment, episodes: int = EPISODES) -> chex.Array | None:
     """(episodes,) int32 bound on the held-out starts, for a task that offers `shortest_steps`."""
     bound = getattr(env, "shortest_steps", None)
-    return (
-        None if bound is None else jax.vmap(lambda k: bound(env.reset(k)))(held_out_keys(episodes))
-    )
+    if bound is None:
+        return None
+    return jax.jit(jax.vmap(lambda key: bound(env.reset(key))))(held_out_keys(episodes))
 
 
 def _play(env: Environment, choose: Any, actors: Actors, key: chex.PRNGKey) -> Evaluation:

@@ -1,0 +1,157 @@
+"""Held-out episodes, the random policy, the bound; and acting with a policy."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.evaluation import (
+    EPISODES,
+    Agent,
+    evaluate,
+    evaluate_random,
+    held_out_keys,
+    shortest_path_steps,
+)
+from sumajax.policies import make_policy
+from sumajax.upsampling import StateUpsampled
+
+PP = PredatorPrey(size=5, num_predators=3, vision=1, max_steps=80)
+PCP = PredatorCapturePrey(size=5, num_predators=2, num_capturers=1, vision=1, max_steps=80)
+TINY = PredatorPrey(size=3, num_predators=2, max_steps=12)
+TINY_PCP = PredatorCapturePrey(size=3, num_predators=1, num_capturers=1, max_steps=12)
+FEW = 16
+
+
+@cache
+def tiny_policy():
+    policy = make_policy("ic3net", TINY, hidden=4, encoder="linear")
+    return policy, jax.jit(policy.init)(jax.random.key(0))
+
+
+def played(seed=0, *, greedy):
+    policy, params = tiny_policy()
+    return evaluate(TINY, policy, params, jax.random.key(seed), episodes=FEW, greedy=greedy)
+
+
+class TestHeldOutStarts:
+    def test_there_are_1024(self):
+        assert EPISODES == 1024
+        assert held_out_keys().shape == (1024,)
+
+    def test_they_are_the_same_for_ever(self):
+        """Figures of one version can be compared with those of another."""
+        keys = jax.random.key_data(held_out_keys())
+        expected = [[944756501, 178618546], [36542745, 2238904669]]
+        np.testing.assert_array_equal(keys[:2], expected)
+
+    def test_all_of_them_differ(self):
+        assert len(np.unique(jax.random.key_data(held_out_keys()), axis=0)) == EPISODES
+
+    def test_training_does_not_start_from_them(self):
+        """Nor from the keys its episodes are folded from."""
+        held_out = {tuple(k) for k in jax.random.key_data(held_out_keys()).tolist()}
+        seeds = jax.vmap(jax.random.key)(jnp.arange(100))
+        assert not held_out & {tuple(k) for k in jax.random.key_data(seeds).tolist()}
+
+
+class TestRandomPolicy:
+    @pytest.mark.parametrize(
+        ("env", "steps", "success"), [(PP, 68.93, 0.369), (PCP, 70.78, 0.325)], ids=["PP", "PCP"]
+    )
+    def test_level(self, env, steps, success):
+        """environments.md, reference levels over 6,000 episodes; here four standard errors."""
+        result = evaluate_random(env, make_policy("iric", env), jax.random.key(0))
+        assert abs(np.mean(result.steps_taken) - steps) < 4 * 18.4 / np.sqrt(EPISODES)
+        assert abs(np.mean(result.success) - success) < 4 * 0.5 / np.sqrt(EPISODES)
+
+    @pytest.mark.parametrize("env", [TINY, TINY_PCP], ids=["PP", "PCP"])
+    def test_every_episode_is_played_to_its_own_end(self, env):
+        """Step by step: what has ended keeps its figures while others go on; each agent draws from
+        the actions that its class has."""
+        key, mask = jax.random.key(7), jnp.asarray(env.action_mask)
+        result = evaluate_random(env, make_policy("iric", env), key, episodes=FEW)
+
+        @jax.jit
+        def by_hand(states):
+            def step(states, time):
+                logits = jnp.broadcast_to(jnp.where(mask, 0.0, -jnp.inf), (FEW, *mask.shape))
+                actions = jax.random.categorical(jax.random.fold_in(key, time), logits)
+                states, transition = jax.vmap(env.step)(states, actions.astype(jnp.int32))
+                return states, (actions, transition)
+
+            return jax.lax.scan(step, states, jnp.arange(env.max_steps))[1]
+
+        actions, steps = jax.device_get(by_hand(jax.vmap(env.reset)(held_out_keys(FEW))))
+        ends = (steps.terminated | steps.truncated).argmax(0)
+        assert np.array(mask)[np.arange(env.num_agents), actions].all()
+        assert len(set(ends.tolist())) > 2
+        np.testing.assert_array_equal(result.steps_taken, ends + 1)
+        for episode, end in enumerate(ends):
+            assert bool(result.success[episode]) == steps.success[end, episode]
+            earned = steps.reward[: end + 1, episode].mean(-1).sum()
+            np.testing.assert_allclose(result.episode_return[episode], earned, rtol=1e-5)
+
+
+class TestGreedy:
+    def test_ignores_the_key(self):
+        first, other = (played(seed, greedy=True) for seed in (0, 1))
+        jax.tree.map(np.testing.assert_array_equal, first, other)
+
+    def test_sampling_does_not(self):
+        first, again, other = (played(seed, greedy=False) for seed in (0, 0, 1))
+        jax.tree.map(np.testing.assert_array_equal, first, again)
+        assert (first.episode_return != other.episode_return).any()
+
+    def test_takes_the_likeliest_choice_at_every_step(self):
+        policy, params = tiny_policy()
+        agent = Agent(TINY, policy, params)
+        state, carry = jax.jit(TINY.reset)(held_out_keys(FEW)[0]), agent.initial_carry()
+
+        @jax.jit
+        def step(state, carry):
+            carry, actions = agent.act(carry, TINY.observe(state), jax.random.key(0), greedy=True)
+            return TINY.step(state, actions), carry
+
+        for _ in range(TINY.max_steps):
+            (state, transition), carry = step(state, carry)
+            if transition.terminated or transition.truncated:
+                break
+        assert int(played(greedy=True).steps_taken[0]) == int(transition.steps_taken)
+
+    def test_both_kinds_share_one_program(self):
+        policy, params = tiny_policy()
+        played(greedy=False)
+        before = evaluate._cache_size()
+        played(greedy=True)
+        other = jax.tree.map(lambda p: p + 1, params)
+        evaluate(TINY, policy, other, jax.random.key(3), episodes=FEW, greedy=True)
+        assert evaluate._cache_size() == before
+
+
+class TestBound:
+    @pytest.mark.parametrize(
+        ("env", "steps", "deviation"), [(PP, 4.67, 1.33), (PCP, 5.08, 1.36)], ids=["PP", "PCP"]
+    )
+    def test_mean(self, env, steps, deviation):
+        """environments.md: over 20,000 starts; here over the 1,024 held-out ones."""
+        bound = np.asarray(shortest_path_steps(env))
+        assert abs(bound.mean() - steps) < 4 * deviation / np.sqrt(EPISODES)
+        assert abs(bound.std() - deviation) < 0.2
+
+    def test_no_policy_is_faster(self):
+        result = evaluate_random(TINY, make_policy("iric", TINY), jax.random.key(0), episodes=FEW)
+        assert (result.steps_taken >= shortest_path_steps(TINY, FEW)).all()
+
+    def test_seen_at_another_size_it_is_the_same(self):
+        """Upsampling the state changes neither starts nor moves."""
+        seen = StateUpsampled(TINY, 6)
+        np.testing.assert_array_equal(
+            shortest_path_steps(seen, FEW), shortest_path_steps(TINY, FEW)
+        )
+
+    def test_a_task_that_offers_none(self):
+        assert shortest_path_steps(object()) is None
