@@ -2,12 +2,15 @@
 
 import argparse
 import contextlib
+import dataclasses
+import inspect
 import io
 import os
 import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, get_type_hints
 
 import jax
 import tyro
@@ -26,7 +29,7 @@ def main(experiment: type[TransferConfig]) -> None:
         # The subclass gives both tasks a default.
         default = experiment(learner=preset(chosen.preset, chosen.policy))  # type: ignore[call-arg]
         config = _parse(experiment, default)
-        prepare_jax(config.devices)
+        prepare_jax(config.num_devices)
         run_experiment(config)
 
 
@@ -58,15 +61,77 @@ def _parse(experiment: type[TransferConfig], default: TransferConfig) -> Transfe
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(experiment, default=default)
+            return tyro.cli(experiment, default=default, registry=_REGISTRY)
     except SystemExit as stop:
         if stop.code:
-            # A title, then the text; the frame around them depends on the terminal's encoding.
-            lines = [line.strip("│╭╮╰╯─- ") for line in said.getvalue().splitlines()]
-            sentence = " ".join([line for line in lines if line][1:])
-            sentence = re.split("For full helptext|Argument helptext", sentence)[0].strip()
-            raise ValueError(re.sub(r"^Error parsing [\w.-]+: ", "", sentence)) from None
+            raise ValueError(_sentence(said.getvalue())) from None
         raise
+
+
+_REGISTRY = tyro.constructors.ConstructorRegistry()
+
+
+@_REGISTRY.struct_rule
+def _documented_fields(info: Any) -> tyro.constructors.StructConstructorSpec | None:
+    """Options of a configuration with an "Attributes" section: the fields that may be set.
+
+    Left alone, the parser also takes, and then ignores, what is fixed (`init=False`).
+    """
+    cls = info.type
+    explained = _attributes(cls) if isinstance(cls, type) else {}
+    if not explained:
+        return None
+    hints = get_type_hints(cls)
+    given = info.default if isinstance(info.default, cls) else cls()
+    options = tuple(
+        tyro.constructors.StructFieldSpec(
+            name=option.name,
+            type=hints[option.name],
+            default=getattr(given, option.name),
+            helptext=explained.get(option.name),
+        )
+        for option in dataclasses.fields(cls)
+        if option.init
+    )
+    return tyro.constructors.StructConstructorSpec(instantiate=cls, fields=options)
+
+
+def _attributes(cls: type) -> dict[str, str]:
+    """What the docstring of a class, or of the one it derives from, says of each attribute."""
+    docs = [inspect.cleandoc(base.__doc__ or "") for base in cls.__mro__]
+    section = next((doc.split("Attributes:\n")[1] for doc in docs if "Attributes:\n" in doc), "")
+    entries = re.findall(
+        r"^  (\w[\w, ]*): (.*(?:\n    .*)*)", section.split("\n\n")[0], re.MULTILINE
+    )
+    return {name: " ".join(text.split()) for names, text in entries for name in names.split(", ")}
+
+
+_KINDS = {
+    "INT": "a whole number",
+    "FLOAT": "a number",
+    "[INT [INT ...]]": "whole numbers",
+    "INT|{INT INT}": "one whole number or two",
+    "{None}|INT": "a whole number or None",
+    "{None}|FLOAT": "a number or None",
+}
+
+
+def _sentence(box: str) -> str:
+    """What a box of the parser says, without its frame and advice that belongs to a screen."""
+    lines = [line.strip("│╭╮╰╯─| ") for line in box.splitlines()]
+    lines = [line for line in lines if not re.fullmatch("[-+]*", line)][1:]
+    text = re.split(" ?For full helptext| ?Argument helptext", " ".join(lines))[0].strip()
+    if text.startswith("Unrecognized options"):
+        unknown = re.split(" Perhaps you meant| Arguments similar", text)[0]
+        return f"{unknown}; --help lists all there are."
+    value = re.search(r"(?:from|arguments:|base 10:|float:) (\[.*?\]|'.*?')", text)
+    if value and "Argument helptext:" in lines:
+        option, kind = lines[lines.index("Argument helptext:") + 1].split(" ", 1)
+        given = value[1].strip("[]").replace("'", "").replace(",", "")
+        return f"{option} takes {_KINDS.get(kind, kind)}, got {given}."
+    # Both tasks have the same settings: say whose.
+    text = re.sub("^Error parsing (source|target): ", r"\1: ", text)
+    return re.sub(r"^Error parsing [\w.-]+: ", "", text)
 
 
 def _presets(experiment: type[TransferConfig], arguments: list[str]) -> argparse.Namespace:

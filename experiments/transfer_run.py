@@ -10,7 +10,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -35,11 +35,15 @@ from sumajax.transfer import (
     fresh_states,
     run_stage,
     saved_epoch,
+    saved_parts,
     transferred_states,
 )
 from sumajax.upsampling import Scale, StateUpsampled
 
 SOURCE, TRANSFER, SCRATCH = "source", "transfer", "scratch"
+MAX_EPOCHS = 100_000
+"""Updates are counted in 32 bits, and an epoch has at most 20,000."""
+MAX_DEVICES = 256
 EVALUATION_SEED = 7
 """Of the policy's own randomness in held-out episodes; the starts are fixed in the package."""
 
@@ -78,26 +82,45 @@ class TransferConfig:
     """Epochs between held-out evaluations while a target arm trains; 0 for none."""
     threshold: float = 20.0
     """Steps taken that count as solved in the comparison."""
-    devices: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """CPU devices to spread seeds and environments over."""
+    devices: int | None = None
+    """CPU devices to spread seeds and environments over; None: all that they spread over."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     """The learner's settings; what is not given comes from the preset."""
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("source_epochs", 1),
-            ("target_epochs", 0),
-            ("evaluate_every", 0),
-            ("devices", 1),
+        for name, least, most in (
+            ("source_epochs", 1, MAX_EPOCHS),
+            ("target_epochs", 0, MAX_EPOCHS),
+            ("evaluate_every", 0, MAX_EPOCHS),
+            ("num_devices", 1, MAX_DEVICES),
         ):
-            if getattr(self, name) < least:
+            if not least <= getattr(self, name) <= most:
                 raise ValueError(
-                    f"{name.replace('_', '-')} must be at least {least}, got {getattr(self, name)}."
+                    f"{name.removeprefix('num_').replace('_', '-')} must lie between {least} and "
+                    f"{most}, got {getattr(self, name)}."
                 )
-        if not self.seeds or len(set(self.seeds)) != len(self.seeds) or min(self.seeds) < 0:
-            raise ValueError(f"seeds must be distinct numbers from 0, got {list(self.seeds)}.")
-        if not self.threshold > 0:
-            raise ValueError(f"threshold must be greater than 0, got {self.threshold}.")
+        fits = all(0 <= seed < 2**31 for seed in self.seeds)
+        if not self.seeds or not fits or len(set(self.seeds)) != len(self.seeds):
+            raise ValueError(
+                f"seeds must be distinct numbers from 0 to {2**31 - 1}, got {list(self.seeds)}."
+            )
+        if not 0 < self.threshold < float("inf"):
+            raise ValueError(f"threshold must be a number greater than 0, got {self.threshold}.")
+        if self.source_checkpoint is not None and not self.target_epochs:
+            raise ValueError(
+                "source-checkpoint leaves the source stage out and target-epochs 0 the target; "
+                "give target-epochs of at least 1."
+            )
+        parallel.spread(len(self.seeds), self.learner.num_envs, self.num_devices)
+
+    @property
+    def num_devices(self) -> int:
+        """Those asked for, or as many of the machine's as seeds and environments spread over."""
+        if self.devices is not None:
+            return self.devices
+        return parallel.most_devices(
+            len(self.seeds), self.learner.num_envs, min(os.cpu_count() or 1, MAX_DEVICES)
+        )
 
     @property
     def directory(self) -> Path:
@@ -126,16 +149,17 @@ class Run:
             "the source stage",
         )
         if config.source_checkpoint is not None:
-            meta = checkpoint.read_meta(config.source_checkpoint)
-            checkpoint.check_compatible(
-                meta, config.target, run.target_policy, config.source_checkpoint
+            saved_parts(
+                run.stage(TRANSFER),
+                config.source_checkpoint,
+                carry_optimiser=config.carry_optimiser,
             )
         return run
 
     @cached_property
     def mesh(self) -> Mesh:
         return parallel.make_mesh(
-            len(self.config.seeds), self.config.learner.num_envs, self.config.devices
+            len(self.config.seeds), self.config.learner.num_envs, self.config.num_devices
         )
 
     def checkpoints(self, arm: str) -> Path:
@@ -163,8 +187,12 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
       ValueError: when it holds something else, a finished run, or one with other options.
       OSError: when it cannot be written.
     """
-    directory, described = config.directory, _plain(asdict(config))
+    directory = config.directory
+    described = _plain({**asdict(config), "devices": config.num_devices})
+    missing: list[Path] = []
     try:
+        _check_directory(directory, described)  # before anything is written there
+        missing = [path for path in (directory, *directory.parents) if not os.path.lexists(path)]
         directory.mkdir(parents=True, exist_ok=True)
         lock = FileLock(directory / ".lock")
         lock.acquire(timeout=0)
@@ -173,6 +201,9 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
             f"{directory} is in use by another run; choose another --output."
         ) from None
     except OSError as error:
+        for path in missing:
+            with suppress(OSError):
+                path.rmdir()
         raise OSError(
             f"cannot write to {directory} ({error.strerror}); choose another --output."
         ) from None
@@ -190,14 +221,16 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
 def _check_directory(directory: Path, described: dict[str, Any]) -> None:
     file = directory / "config.json"
     if not file.exists():
-        others = sorted(path.name for path in directory.iterdir() if path.name != ".lock")
+        is_there = directory.is_dir()
+        others = sorted(path.name for path in directory.iterdir()) if is_there else []
+        others = [name for name in others if name != ".lock"]
         if others:
             raise ValueError(
                 f"{directory} exists and holds {others[0]!r}, not a run; choose another --output."
             )
         return
     try:
-        before = json.loads(file.read_text())["options"]
+        before = dict(json.loads(file.read_text())["options"])
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{file} is not readable; choose another --output.") from None
     changed = [name for name in described if described[name] != before.get(name, described[name])]
@@ -443,6 +476,7 @@ def run_experiment(config: TransferConfig) -> dict[str, Any]:
     if config.target_epochs:
         arms += [TRANSFER, SCRATCH] if config.scratch else [TRANSFER]
     epochs = {arm: run.stage(arm).epochs for arm in arms}
+    run.mesh  # noqa: B018 - refused, if it is, before anything is written
     with claimed(config) as directory, reporting.Progress(epochs) as progress:
         recorder = Recorder(run, directory, progress)
         source = config.source_checkpoint or run.checkpoints(SOURCE)

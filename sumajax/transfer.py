@@ -72,6 +72,23 @@ def transferred_states(stage: Stage, source: Path, *, carry_optimiser: bool = Fa
     `carry_optimiser`. Seed i starts from the source's seed i, or all from its only one.
 
     Raises:
+      CheckpointError: as for `saved_parts`.
+    """
+    fresh = fresh_states(stage)
+    saved = saved_parts(stage, source, carry_optimiser=carry_optimiser)
+    carried = {
+        field: jax.tree.map(
+            lambda x, y: jnp.broadcast_to(jnp.asarray(x), y.shape), part, getattr(fresh, field)
+        )
+        for field, part in saved.items()
+    }
+    return replace(fresh, **carried)
+
+
+def saved_parts(stage: Stage, source: Path, *, carry_optimiser: bool = False) -> dict[str, Any]:
+    """What `stage` would take over from `source`, by field of its states; compiles nothing.
+
+    Raises:
       CheckpointError: when there is no good checkpoint, or it does not fit: the sentence names the
         setting or the leaf and both values.
     """
@@ -83,18 +100,14 @@ def transferred_states(stage: Stage, source: Path, *, carry_optimiser: bool = Fa
             f"{source} holds {len(saved_seeds)} seeds, this stage has {len(stage.seeds)}; train as "
             "many, or transfer from one seed."
         )
-    fresh = fresh_states(stage)
-    for field in ("params", "opt_state") if carry_optimiser else ("params",):
-        like = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct((len(saved_seeds), *x.shape[1:]), x.dtype),
-            getattr(fresh, field),
-        )
-        saved = checkpoint.load_params(source, like, field=field)
-        carried = jax.tree.map(
-            lambda x, y: jnp.broadcast_to(jnp.asarray(x), y.shape), saved, getattr(fresh, field)
-        )
-        fresh = replace(fresh, **{field: carried})
-    return fresh
+    like = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((len(saved_seeds), *x.shape[1:]), x.dtype),
+        jax.eval_shape(lambda: fresh_states(stage)),
+    )
+    fields = ("params", "opt_state") if carry_optimiser else ("params",)
+    return {
+        field: checkpoint.load_params(source, getattr(like, field), field=field) for field in fields
+    }
 
 
 def run_stage(

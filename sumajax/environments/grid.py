@@ -15,6 +15,9 @@ UP, RIGHT, DOWN, LEFT, STAY, CAPTURE = range(6)
 OUTSIDE = -1
 """What a window shows in every channel where it reaches over the edge of the grid."""
 
+MAX_SIDE = 2**14 - 1
+"""Cells along a side: `_number` tells the cells of a window apart up to there."""
+
 NOWHERE = -(2**14)
 """Row and column of a cell that no window reaches, to fill up a list of entities."""
 

@@ -29,6 +29,9 @@ PREY_REWARD = 0.05
 NEAR_CAPTURE_REWARD = -0.025
 """Second reward scheme: a capture agent that stands on the prey but has not captured it."""
 
+MAX_STEPS = 2**31 - 1
+"""Steps are counted in int32."""
+
 PREDATOR, CAPTURER = 0, 1
 
 RewardMode = Literal["mixed", "cooperative", "competitive"]
@@ -317,6 +320,12 @@ def _validate(env: PredatorCapturePrey) -> None:
     for name, least in least_values.items():
         if getattr(env, name) < least:
             raise ValueError(f"{name} must be at least {least}, got {getattr(env, name)}.")
+    if max(rows, columns) > grid.MAX_SIDE:
+        raise ValueError(
+            f"the {rows}x{columns} grid is too large; its sides have at most {grid.MAX_SIDE} cells."
+        )
+    if env.max_steps > MAX_STEPS:
+        raise ValueError(f"max_steps must be at most {MAX_STEPS}, got {env.max_steps}.")
     if env.num_agents < 1:
         raise ValueError("the team is empty; give at least one predator or capture agent.")
     if env.num_agents + 1 > rows * columns:

@@ -1,6 +1,9 @@
 """The learner's settings and their two presets. Sources of every number: docs/settings.md."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from math import inf
+from numbers import Real
 from typing import Any, Literal, get_args
 
 EPOCH_STEPS = 20_000
@@ -154,15 +157,24 @@ _LEAST: dict[str, int] = {
     "detach_gap": 1,
 }
 
-_RANGES: dict[str, tuple[float, float]] = {
-    "gamma": (0.0, 1.0),
-    "gae_lambda": (0.0, 1.0),
-    "team_reward": (0.0, 1.0),
-    "anneal_to": (0.0, 1.0),
-    "value_weight": (0.0, float("inf")),
-    "policy_weight": (0.0, float("inf")),
-    "entropy_weight": (0.0, float("inf")),
+_UNIT = (lambda x: 0 <= x <= 1, "lie between 0 and 1")
+_WEIGHT = (lambda x: 0 <= x < inf, "be a finite number of at least 0")
+_POSITIVE = (lambda x: 0 < x < inf, "be a finite number greater than 0")
+
+_NUMBERS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "gamma": _UNIT,
+    "gae_lambda": _UNIT,
+    "team_reward": _UNIT,
+    "anneal_to": _UNIT,
+    "value_weight": _WEIGHT,
+    "policy_weight": _WEIGHT,
+    "entropy_weight": _WEIGHT,
+    "learning_rate": _POSITIVE,
+    "max_grad_norm": _POSITIVE,
 }
+"""What a number must be, as a test and in words."""
+
+_SWITCHES = ("whole_episodes", "bootstrap_timeouts", "mask_inactive", "clip_per_env")
 
 
 def _validate(config: LearnerConfig) -> None:
@@ -171,15 +183,13 @@ def _validate(config: LearnerConfig) -> None:
         value = given.get(name, least)
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}.")
-    for name, (low, high) in _RANGES.items():
-        if not low <= getattr(config, name) <= high:
-            raise ValueError(
-                f"{name} must lie between {low:g} and {high:g}, got {getattr(config, name)!r}."
-            )
-    for name in ("learning_rate", "max_grad_norm"):
+    for name in _SWITCHES:
+        if not isinstance(given[name], bool):
+            raise ValueError(f"{name} must be True or False, got {given[name]!r}.")
+    for name, (fits, words) in _NUMBERS.items():
         value = given.get(name, 1.0)
-        if value is None or not 0 < value < float("inf"):
-            raise ValueError(f"{name} must be greater than 0, got {value!r}.")
+        if isinstance(value, bool) or not isinstance(value, Real) or not fits(float(value)):
+            raise ValueError(f"{name} must {words}, got {value!r}.")
     for name, choices in (
         ("optimiser", Optimiser),
         ("loss", Loss),
@@ -192,6 +202,8 @@ def _validate(config: LearnerConfig) -> None:
             )
     if config.loss == "hetnet":
         _validate_hetnet(config)
+    if config.clip_per_env and config.max_grad_norm is None:
+        raise ValueError("clip_per_env needs max_grad_norm, got None; give the norm to clip at.")
     steps = config.num_envs * config.rollout_length
     if EPOCH_STEPS % steps:
         raise ValueError(

@@ -41,14 +41,12 @@ def use_cpu_devices(count: int) -> None:
     jax.config.update("jax_num_cpu_devices", count)
 
 
-def make_mesh(num_seeds: int, num_envs: int, devices: int) -> Mesh:
-    """`devices` devices as (seeds, envs).
+def spread(num_seeds: int, num_envs: int, devices: int) -> tuple[int, int]:
+    """How many devices share the seeds, and how many the environments of each.
 
     Raises:
-      ValueError: when there are not so many devices, or seeds and environments do not spread.
+      ValueError: when seeds and environments do not spread over so many.
     """
-    if devices > jax.device_count():
-        raise ValueError(f"{devices} devices asked for, but JAX sees {jax.device_count()}.")
     over_seeds = math.gcd(num_seeds, devices)
     over_envs = devices // over_seeds
     if num_envs % over_envs:
@@ -56,7 +54,31 @@ def make_mesh(num_seeds: int, num_envs: int, devices: int) -> Mesh:
             f"{num_envs} environments do not spread over {over_envs} devices; choose numbers that "
             "divide."
         )
-    return Mesh(np.array(jax.devices()[:devices]).reshape(over_seeds, over_envs), (SEEDS, ENVS))
+    return over_seeds, over_envs
+
+
+def most_devices(num_seeds: int, num_envs: int, most: int) -> int:
+    """The largest number of devices up to `most` that seeds and environments spread over."""
+
+    def fits(devices: int) -> bool:
+        return num_envs % (devices // math.gcd(num_seeds, devices)) == 0
+
+    return next(filter(fits, range(most, 1, -1)), 1)
+
+
+def make_mesh(num_seeds: int, num_envs: int, devices: int) -> Mesh:
+    """`devices` devices as (seeds, envs).
+
+    Raises:
+      ValueError: when there are not so many devices, or seeds and environments do not spread.
+    """
+    shape = spread(num_seeds, num_envs, devices)
+    if devices > jax.device_count():
+        raise ValueError(
+            f"{devices} devices asked for, but JAX sees {jax.device_count()}; ask for at most "
+            "those."
+        )
+    return Mesh(np.array(jax.devices()[:devices]).reshape(shape), (SEEDS, ENVS))
 
 
 def init_seeds(learner: Learner, seeds: list[int]) -> TrainState:

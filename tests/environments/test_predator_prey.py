@@ -330,6 +330,11 @@ class TestMistakes:
             ),
             ({"num_predators": 2.0}, "num_predators must be a whole number, got 2.0."),
             ({"max_steps": 0}, "max_steps must be at least 1, got 0."),
+            ({"max_steps": 2**31}, "max_steps must be at most 2147483647, got 2147483648."),
+            (
+                {"size": (3, 2**14)},
+                "the 3x16384 grid is too large; its sides have at most 16383 cells.",
+            ),
             ({"vision": -1}, "vision must be at least 0, got -1."),
             (
                 {"vision": 5},

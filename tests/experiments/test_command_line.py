@@ -1,56 +1,320 @@
 """What a person can get wrong on the command line: one sentence, status 2, nothing left behind."""
 
+import os
+import subprocess
 import sys
+import time
+from pathlib import Path
 
 import command_line
+import jax
+import numpy as np
 import pytest
+from pcp_transfer import PCPTransfer
 from pp_transfer import PPTransfer
 
-BAD = {
-    "size not a multiple": (["--target.size", "12"], "12x12 is not a whole multiple of the source"),
-    "vision too large": (["--source.vision", "5"], "vision 5 must be smaller than the sides"),
-    "vision differs": (["--target.vision", "2"], "vision differs: 1 in the source stage, 2"),
-    "too many agents": (["--source.num-predators", "30"], "30 agents and a prey need 31 distinct"),
-    "no agents": (["--source.num-predators", "0"], "the team is empty"),
-    "negative epochs": (["--source-epochs", "-1"], "source-epochs must be at least 1, got -1"),
-    "negative target epochs": (
-        ["--target-epochs", "-3"],
-        "target-epochs must be at least 0, got -3",
-    ),
-    "unknown policy": (["--policy", "nope"], "policy 'nope' is unknown; choose one of ic3net"),
-    "unknown preset": (["--preset", "nope"], "preset 'nope' is unknown; choose one of fast, paper"),
-    "unknown option": (["--spam", "3"], "Unrecognized options: --spam"),
-    "not a number": (["--source-epochs", "ten"], "invalid literal for int() with base 10: 'ten'"),
-    "equal seeds": (["--seeds", "1", "1"], "seeds must be distinct numbers from 0, got [1, 1]"),
-    "no step limit": (["--target.max-steps", "0"], "max_steps must be at least 1, got 0"),
-    "odd batch": (["--learner.num-envs", "64"], "do not divide an epoch of 20000"),
-    "discount": (["--learner.gamma", "1.5"], "gamma must lie between 0 and 1, got 1.5"),
-    "rate": (["--learner.learning-rate", "0"], "learning_rate must be greater than 0"),
-    "no devices": (["--devices", "0"], "devices must be at least 1, got 0"),
-    "missing checkpoint": (["--source-checkpoint", "{tmp}/none"], "{tmp}/none is no directory"),
-    "foreign checkpoint": (["--source-checkpoint", "{tmp}/foreign"], "{tmp}/foreign"),
-    "existing output": (["--output", "{tmp}/foreign"], "holds 'notes.txt', not a run"),
-    "unwritable output": (["--output", "{tmp}/foreign/notes.txt/run"], "cannot write to"),
+from sumajax import checkpoint
+from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.learning import LearnerConfig, make_learner
+from sumajax.policies import make_policy
+from sumajax.upsampling import StateUpsampled
+
+UNSHARED = "do not spread over"
+CLASS = "is unknown; choose one of"
+
+TASKS = {
+    "--target.size 12": "target size 12x12 is not a whole multiple of the source size 5x5",
+    "--source.size 11": "target size 10x10 is not a whole multiple of the source size 11x11",
+    "--target.size 4": "target size 4x4 is not a whole multiple of the source size 5x5; choose",
+    "--source.size 2 3": "target size 10x10 is not a whole multiple of the source size 2x3",
+    "--source.size 0": "source: size must be a positive int or (rows, columns), got 0.",
+    "--target.size -5": "target: size must be a positive int or (rows, columns), got -5.",
+    "--source.size 5.5": "--source.size takes one whole number or two, got 5.5.",
+    "--source.size 5 5 5": "--source.size takes one whole number or two, got 5 5 5.",
+    "--source.size 20000": "the 20000x20000 grid is too large; its sides have at most 16383 cells",
+    "--source.vision 5": "vision 5 must be smaller than the sides of the 5x5 grid; use at most 4.",
+    "--target.vision 10": "vision 10 must be smaller than the sides of the 10x10 grid",
+    "--target.vision 2": "vision differs: 1 in the source stage, 2 in this stage; give both",
+    "--source.vision -1": "source: vision must be at least 0, got -1.",
+    "--source.num-predators 30": "30 agents and a prey need 31 distinct cells, but a 5x5 grid has",
+    "--target.num-predators 100": "use fewer agents or a larger grid",
+    "--source.num-predators 0": "the team is empty; give at least one predator",
+    "--target.num-predators -1": "target: num_predators must be at least 0, got -1.",
+    "--target.max-steps 0": "target: max_steps must be at least 1, got 0.",
+    "--source.max-steps 2147483648": "max_steps must be at most 2147483647, got 2147483648.",
+    "--source.reward-mode selfish": "invalid choice 'selfish' for argument '--source.reward-mode'",
+    "--scale sum": "invalid choice 'sum' for argument '--scale'. Expected one of ('none', 'mass')",
+    # A predator has nothing to capture: Predator-Prey has no such settings.
+    "--source.num-capturers 1": "Unrecognized options: --source.num-capturers, 1; --help lists",
+    "--source.capture-vision 1": "Unrecognized options: --source.capture-vision, 1; --help lists",
+    "--target.capture-reward second": "Unrecognized options: --target.capture-reward, second",
 }
 
+CAPTURE_TASKS = {
+    "--source.num-capturers -1": "source: num_capturers must be at least 0, got -1.",
+    "--source.num-predators 0 --source.num-capturers 0": "the team is empty; give at least one",
+    "--source.num-capturers 23": "25 agents and a prey need 26 distinct cells, but a 5x5 grid has",
+    "--source.capture-vision 2": "capture_vision 2 must lie between 0 and vision 1, or be None",
+    "--target.capture-vision -1": "capture_vision -1 must lie between 0 and vision 1",
+    "--target.capture-vision far": "--target.capture-vision takes a whole number or None, got far.",
+    "--source.capture-reward third": "invalid choice 'third' for argument '--source.capture-rew",
+}
 
-@pytest.mark.parametrize(("arguments", "sentence"), BAD.values(), ids=BAD)
-def test_a_mistake_gets_one_sentence(arguments, sentence, tmp_path, monkeypatch, capsys):
-    (tmp_path / "foreign").mkdir()
-    (tmp_path / "foreign" / "notes.txt").write_text("mine")
+RUNS = {
+    "--policy telepathy": f"policy 'telepathy' {CLASS} ic3net, commnet",
+    "--policy": "Missing value for argument '--policy'",
+    "--preset slow": f"preset 'slow' {CLASS} fast, paper.",
+    "--preset=slow --policy=telepathy": f"preset 'slow' {CLASS} fast, paper.",
+    "--source-epochs -1": "source-epochs must lie between 1 and 100000, got -1.",
+    "--source-epochs 0": "source-epochs must lie between 1 and 100000, got 0.",
+    "--source-epochs 100001": "source-epochs must lie between 1 and 100000, got 100001.",
+    "--source-epochs ten": "--source-epochs takes a whole number, got ten.",
+    "--target-epochs -3": "target-epochs must lie between 0 and 100000, got -3.",
+    "--target-epochs 1.5": "--target-epochs takes a whole number, got 1.5.",
+    "--evaluate-every -1": "evaluate-every must lie between 0 and 100000, got -1.",
+    "--seeds": "seeds must be distinct numbers from 0 to 2147483647, got [].",
+    "--seeds 1 1": "seeds must be distinct numbers from 0 to 2147483647, got [1, 1].",
+    "--seeds -1": "seeds must be distinct numbers from 0 to 2147483647, got [-1].",
+    "--seeds 2147483648": "seeds must be distinct numbers from 0 to 2147483647, got [2147483648].",
+    "--seeds one": "--seeds takes whole numbers, got one.",
+    "--threshold 0": "threshold must be a number greater than 0, got 0.0.",
+    "--threshold nan": "threshold must be a number greater than 0, got nan.",
+    "--threshold inf": "threshold must be a number greater than 0, got inf.",
+    "--devices 0": "devices must lie between 1 and 256, got 0.",
+    "--devices 100000": "devices must lie between 1 and 256, got 100000.",
+    "--devices 7": f"50 environments {UNSHARED} 7 devices; choose numbers that divide.",
+    "--devices 4 --seeds 0 1 --learner.num-envs 25": f"25 environments {UNSHARED} 2 devices",
+    "--spam 3": "Unrecognized options: --spam, 3; --help lists all there are.",
+    "--seed 1": "Unrecognized options: --seed, 1; --help lists all there are.",
+    "spam": "Unrecognized options: spam; --help lists all there are.",
+    "--scratch maybe": "Unrecognized options: maybe; --help lists all there are.",
+}
+
+LEARNER = {
+    "num-envs 64": "64 environments x 10 steps = 640 steps per update do not divide an epoch of",
+    "num-envs 0": "num_envs must be a whole number of at least 1, got 0.",
+    "num-envs -5": "num_envs must be a whole number of at least 1, got -5.",
+    "num-envs 40000": "do not divide an epoch of 20000; 1000 environments or 2000 environments",
+    "rollout-length 0": "rollout_length must be a whole number of at least 1, got 0.",
+    "rollout-length 3": "150 steps per update do not divide an epoch of 20000; a rollout_length",
+    "gamma 1.5": "gamma must lie between 0 and 1, got 1.5.",
+    "gamma nan": "gamma must lie between 0 and 1, got nan.",
+    "gae-lambda -0.1": "gae_lambda must lie between 0 and 1, got -0.1.",
+    "team-reward 1.1": "team_reward must lie between 0 and 1, got 1.1.",
+    "anneal-to 2": "anneal_to must lie between 0 and 1, got 2.0.",
+    "value-weight -1": "value_weight must be a finite number of at least 0, got -1.0.",
+    "value-weight inf": "value_weight must be a finite number of at least 0, got inf.",
+    "policy-weight -1": "policy_weight must be a finite number of at least 0, got -1.0.",
+    "entropy-weight nan": "entropy_weight must be a finite number of at least 0, got nan.",
+    "learning-rate 0": "learning_rate must be a finite number greater than 0, got 0.0.",
+    "learning-rate inf": "learning_rate must be a finite number greater than 0, got inf.",
+    "learning-rate None": "--learner.learning-rate takes a number, got None.",
+    "max-grad-norm -1": "max_grad_norm must be a finite number greater than 0, got -1.0.",
+    "max-grad-norm x": "--learner.max-grad-norm takes a number or None, got x.",
+    "warmup-epochs -1": "warmup_epochs must be a whole number of at least 0, got -1.",
+    "anneal-epochs -2": "anneal_epochs must be a whole number of at least 0, got -2.",
+    "detach-gap 0": "detach_gap must be a whole number of at least 1, got 0.",
+    "optimiser sgd": "invalid choice 'sgd' for argument '--learner.optimiser'. Expected one of",
+    "loss ppo": "invalid choice 'ppo' for argument '--learner.loss'. Expected one of",
+    "advantages big": "invalid choice 'big' for argument '--learner.advantages'. Expected one of",
+    "clip-per-env --learner.max-grad-norm None": "clip_per_env needs max_grad_norm, got None",
+    "loss hetnet": "loss 'hetnet' needs whole_episodes=True, got False; preset 'paper' of policy",
+    "spam 3": "Unrecognized options: --learner.spam, 3; --help lists all there are.",
+    "no-whole-episodes --preset paper --policy hetnet": "loss 'hetnet' needs whole_episodes=True",
+    "team-reward 0.5 --preset paper --policy hetnet": "loss 'hetnet' needs team_reward=0.0, got 0.",
+    "mask-inactive --preset paper --policy hetnet": "loss 'hetnet' needs mask_inactive=False, got",
+}
+
+SOURCES = {
+    "missing": "missing is no directory; give a directory that sumajax saved to.",
+    "foreign": "foreign holds no checkpoint of sumajax; give a directory that sumajax saved to.",
+    "foreign/notes.txt": "notes.txt is no directory; give a directory that sumajax saved to.",
+    "truncated": "has 0 bytes instead of",
+    "without_description": "(its file checkpoint.json is missing); restore it from a copy",
+    "newer": "is of checkpoint format 99 and this sumajax reads 1; use the sumajax it was",
+    "undescribed": "does not say which task and policy it is of; save it with meta from describe",
+    "policy": "policy differs: commnet in",
+    "width": "policy setting hidden differs: 16 in",
+    "vision": "vision differs: 2 in",
+    "channels": "number of observation channels differs: 3 in",
+    "grid": "the policy's grid differs: 5x5 in",
+    "shape": "leaf params/params/core/action/bias is float32[1, 9] in",
+    "weights": "in this program; use the policy, settings and seeds it was saved with",
+    "no_params": "holds no params; give a checkpoint of a training run.",
+    "seeds --seeds 0 1 2": "holds 2 seeds, this stage has 3; train as many, or transfer from one",
+    "good --carry-optimiser": "holds no opt_state; give a checkpoint of a training run.",
+    "good --target-epochs 0": "source-checkpoint leaves the source stage out and target-epochs 0",
+}
+"""A directory of `sources`, and more options."""
+
+OUTPUTS = {
+    "foreign": "holds 'notes.txt', not a run; choose another --output.",
+    "foreign/notes.txt": "cannot write to",
+    "foreign/notes.txt/run": "cannot write to",
+    "long": "cannot write to",
+    "below/long": "cannot write to",
+    "other": "other holds a run with seeds [7], not [0]; choose another --output, or the same",
+    "garbled": "config.json is not readable; choose another --output.",
+    "listed": "config.json is not readable; choose another --output.",
+    "finished": "finished holds a finished run; choose another --output or remove it.",
+}
+"""A directory of `outputs`."""
+
+BAD: list[tuple[type, str, str]] = [
+    *((PPTransfer, options, sentence) for options, sentence in TASKS.items()),
+    *((PCPTransfer, options, sentence) for options, sentence in CAPTURE_TASKS.items()),
+    *((PPTransfer, options, sentence) for options, sentence in RUNS.items()),
+    *((PPTransfer, f"--learner.{options}", sentence) for options, sentence in LEARNER.items()),
+    *((PPTransfer, f"--source-checkpoint @{name}", words) for name, words in SOURCES.items()),
+    *(
+        (PPTransfer, f"--devices 1 --output @{name}", sentence)
+        for name, sentence in OUTPUTS.items()
+    ),
+]
+
+COMPILED: list[str] = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, seconds, **more: COMPILED.append(event) if "backend_compile" in event else None
+)
+
+
+@pytest.fixture(scope="module")
+def there(tmp_path_factory):
+    """Where `@name` of the tables is: source checkpoints and outputs of every bad kind."""
+    directory = tmp_path_factory.mktemp("there")
+    (directory / "foreign").mkdir()
+    (directory / "foreign" / "notes.txt").write_text("mine")
+    make_sources(directory)
+    make_outputs(directory)
+    return directory
+
+
+def make_sources(directory: Path) -> None:
+    env = StateUpsampled(PredatorPrey(size=5, num_predators=3), 10)
+    wide = StateUpsampled(PredatorPrey(size=5, vision=2), 10)
+    policy = make_policy("ic3net", env)
+    state = jax.eval_shape(make_learner(env, policy, LearnerConfig()).init, jax.random.key(0))
+    params = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape), leaf.dtype), state.params)
+    few = {"params": {"w": np.zeros(1)}}
+    odd = jax.tree_util.tree_map_with_path(
+        lambda path, leaf: np.zeros((1, 9), leaf.dtype) if is_action_bias(path) else leaf, params
+    )
+    described = checkpoint.describe(env, policy)
+
+    def save(name, state, meta):
+        return checkpoint.save(directory / name, state, meta)
+
+    def save_few(name, env, policy="ic3net", **settings):
+        save(name, few, checkpoint.describe(env, make_policy(policy, env, **settings)))
+
+    save("good", {"params": params}, described)
+    save("shape", {"params": odd}, described)
+    save("weights", few, described)
+    save("no_params", {"weights": np.zeros(1)}, described)
+    save("seeds", few, {**described, "seeds": [0, 1]})
+    save("undescribed", few, {})
+    save_few("policy", env, "commnet")
+    save_few("width", env, hidden=16)
+    save_few("vision", wide)
+    save_few("channels", PredatorCapturePrey(size=10))
+    save_few("grid", env.env)
+    (save("without_description", few, described) / checkpoint.DESCRIPTION).unlink()
+    truncated = save("truncated", few, described)
+    max(truncated.rglob("*/d/*"), key=lambda file: file.stat().st_size).write_bytes(b"")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint, "VERSION", 99)
+        save("newer", few, described)
+
+
+def is_action_bias(path) -> bool:
+    return jax.tree_util.keystr(path, simple=True, separator="/").endswith("action/bias")
+
+
+def make_outputs(directory: Path) -> None:
+    for name, config in (
+        ("other", '{"options": {"seeds": [7]}}'),
+        ("garbled", '{"options": '),
+        ("listed", '{"options": 3}'),
+        ("finished", '{"options": {}}'),
+    ):
+        (directory / name).mkdir()
+        (directory / name / "config.json").write_text(config)
+    (directory / "finished" / "summary.json").write_text("{}")
+
+
+def files(directory: Path) -> dict[str, bytes | None]:
+    return {str(p): p.read_bytes() if p.is_file() else None for p in directory.rglob("*")}
+
+
+def command(options: str, there: Path) -> list[str]:
+    return options.replace("@", f"{there}/").replace("long", "a" * 300).split()
+
+
+def assert_one_sentence(said: str, sentence: str) -> None:
+    (line,) = said.strip().splitlines()
+    assert line.startswith("error: ")
+    assert line.endswith(".")
+    assert sentence in line
+
+
+def test_the_table_is_long():
+    assert len(BAD) > 60
+
+
+@pytest.mark.parametrize(("experiment", "options", "sentence"), BAD, ids=[row[1] for row in BAD])
+def test_a_mistake_gets_one_sentence(
+    experiment, options, sentence, there, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(command_line, "prepare_jax", lambda devices: None)
-    arguments = [argument.format(tmp=tmp_path) for argument in arguments]
-    monkeypatch.setattr(sys, "argv", ["pp_transfer.py", *arguments])
+    monkeypatch.setattr(sys, "argv", ["experiment.py", *command(options, there)])
+    compiled, before = len(COMPILED), files(there)
+    began = time.process_time()
     with pytest.raises(SystemExit) as stop:
-        command_line.main(PPTransfer)
-    said = capsys.readouterr().err.strip().splitlines()
+        command_line.main(experiment)
+    assert time.process_time() - began < 10
     assert stop.value.code == 2
-    assert len(said) == 1
-    assert said[0].startswith("error: ")
-    assert sentence.format(tmp=tmp_path) in said[0]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["foreign"]
-    assert (tmp_path / "foreign" / "notes.txt").read_text() == "mine"
+    said = capsys.readouterr()
+    assert_one_sentence(said.err, sentence)
+    assert said.out == ""
+    assert COMPILED[compiled:] == []
+    assert list(tmp_path.iterdir()) == []
+    assert files(there) == before
+
+
+def test_the_program_itself_ends_with_status_2(there, tmp_path):
+    """The same as a person sees it: a process, its status and what it prints."""
+    program = Path(command_line.__file__).with_name("pp_transfer.py")
+    rows = {
+        "--devices 7 --learner.num-envs 100": f"100 environments {UNSHARED} 7 devices",
+        "--source-checkpoint @truncated": SOURCES["truncated"],
+    }
+    running = [
+        subprocess.Popen(
+            [sys.executable, str(program), *command(options, there)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=tmp_path,
+        )
+        for options in rows
+    ]
+    for process, sentence in zip(running, rows.values(), strict=True):
+        said, complained = process.communicate()
+        assert process.returncode == 2
+        assert said == ""
+        assert_one_sentence(complained, sentence)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("width", ["40", "200"])
+def test_the_sentence_does_not_depend_on_the_terminal(width, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", width)
+    monkeypatch.setattr(sys, "argv", ["pp_transfer.py", "--learner.warmup-epochs", "-1"])
+    with pytest.raises(SystemExit):
+        command_line.main(PPTransfer)
+    sentence = "error: warmup_epochs must be a whole number of at least 0, got -1.\n"
+    assert capsys.readouterr().err == sentence
 
 
 def test_the_preset_decides_the_learners_defaults():
@@ -68,3 +332,13 @@ def test_help_is_readable(monkeypatch, capsys):
     options = "--policy --preset --seeds --source-epochs --target-epochs --output --no-scratch"
     for option in [*options.split(), "--source.size", "--target.num-predators"]:
         assert option in text
+    assert "--source.num-capturers" not in text
+    for explained in ("discount and trace decay", "step limit of an episode"):
+        assert explained in text
+
+
+def test_as_many_devices_as_fit(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    assert PPTransfer().num_devices == 5  # of 8; 50 environments do not spread over more
+    assert PPTransfer(seeds=(0, 1, 2)).num_devices == 6
+    assert PPTransfer(devices=2).num_devices == 2

@@ -61,7 +61,7 @@ def test_environments_of_a_seed_over_two_devices(two_devices):
 
 
 def test_more_devices_than_there_are():
-    with pytest.raises(ValueError, match=r"64 devices asked for, but JAX sees \d+\."):
+    with pytest.raises(ValueError, match=r"64 devices asked for, but JAX sees \d+;"):
         parallel.make_mesh(1, 64, devices=64)
 
 
@@ -69,3 +69,16 @@ def test_environments_that_do_not_spread(monkeypatch):
     monkeypatch.setattr(jax, "device_count", lambda: 4)
     with pytest.raises(ValueError, match="25 environments do not spread over 4 devices"):
         parallel.make_mesh(3, 25, devices=4)
+
+
+@pytest.mark.parametrize(
+    ("num_seeds", "num_envs", "most", "expected"),
+    [(1, 50, 8, 5), (3, 50, 8, 6), (3, 50, 2, 2), (1, 49, 6, 1), (7, 49, 14, 7), (2, 4, 64, 8)],
+)
+def test_the_most_devices_that_seeds_and_environments_spread_over(
+    num_seeds, num_envs, most, expected
+):
+    assert parallel.most_devices(num_seeds, num_envs, most) == expected
+    over_seeds, over_envs = parallel.spread(num_seeds, num_envs, expected)
+    assert over_seeds * over_envs == expected
+    assert num_seeds % over_seeds == num_envs % over_envs == 0
