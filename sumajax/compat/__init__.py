@@ -1,0 +1,1 @@
+"""The tasks under other libraries' conventions; those libraries need not be installed."""
