@@ -10,7 +10,7 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import jax
 import tyro
@@ -21,6 +21,12 @@ from sumajax.learning import parallel, preset
 CACHE = Path.home() / ".cache" / "sumajax" / "compiled"
 """Compiled programs; SUMAJAX_NO_CACHE=1 turns it off, JAX_COMPILATION_CACHE_DIR moves it."""
 
+STOPPED = 3
+"""Exit status of a run that ended, but in which a seed stopped on the way."""
+
+Options = TypeVar("Options")
+GOES_ON = "stopped; the same command goes on from the last checkpoint."
+
 
 def main(experiment: type[TransferConfig]) -> None:
     """Reads the options of a transfer experiment and runs it."""
@@ -28,14 +34,19 @@ def main(experiment: type[TransferConfig]) -> None:
         chosen = _presets(experiment, sys.argv[1:])
         # The subclass gives both tasks a default.
         default = experiment(learner=preset(chosen.preset, chosen.policy))  # type: ignore[call-arg]
-        config = _parse(experiment, default)
+        config = parse(experiment, default)
         prepare_jax(config.num_devices)
-        run_experiment(config)
+        if run_experiment(config).get("stops"):
+            raise SystemExit(STOPPED)
 
 
 @contextlib.contextmanager
-def plain_errors() -> Iterator[None]:
-    """What a person can get wrong becomes one sentence on standard error and exit status 2."""
+def plain_errors(stopped: str = GOES_ON) -> Iterator[None]:
+    """What a person can get wrong becomes one sentence on standard error and exit status 2.
+
+    Args:
+      stopped: what Ctrl-C says.
+    """
     try:
         yield
     except (ValueError, OSError) as error:
@@ -44,7 +55,7 @@ def plain_errors() -> Iterator[None]:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
-        print("stopped; the same command goes on from the last checkpoint.", file=sys.stderr)
+        print(stopped, file=sys.stderr)
         raise SystemExit(130) from None
 
 
@@ -56,12 +67,16 @@ def prepare_jax(devices: int) -> None:
         jax.config.update("jax_compilation_cache_dir", str(CACHE))
 
 
-def _parse(experiment: type[TransferConfig], default: TransferConfig) -> TransferConfig:
-    """The options; what the parser draws in a box for a mistake comes out as one sentence."""
+def parse(options: type[Options], default: Options) -> Options:
+    """The command line as `options`; a mistake, which the parser draws in a box, is one sentence.
+
+    Raises:
+      ValueError: for what is no such option or value.
+    """
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(experiment, default=default, registry=_REGISTRY)
+            return tyro.cli(options, default=default, registry=_REGISTRY)
     except SystemExit as stop:
         if stop.code:
             raise ValueError(_sentence(said.getvalue())) from None
