@@ -1,0 +1,25 @@
+"""The pages in docs/: their code runs, in the order it stands, and their links lead somewhere."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def test_extending(capsys):
+    shared: dict = {}
+    for code in re.findall(r"```python\n(.*?)```", (DOCS / "extending.md").read_text(), re.DOTALL):
+        exec(compile(code, "extending.md", "exec"), shared)
+    assert shared["metrics"].env_steps.tolist() == [20_000, 20_000]
+    assert shared["result"].success.mean() > 0.5  # random: 0.1
+    assert capsys.readouterr().out.count("steps taken") == 2
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.name)
+def test_links(page):
+    for link in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text()):
+        assert (DOCS / link).exists(), link
+    for file in re.findall(r"`((?:sumajax|experiments|tests)/[\w/.]+)`", page.read_text()):
+        assert (DOCS.parent / file).exists(), file
