@@ -20,6 +20,8 @@ from sumajax.policies.types import Policy
 HELD_OUT_SEED = 20_240_229
 """Of the held-out starts; training keys are folded from small seeds, never from this."""
 EPISODES = 1024
+LANES = 128
+"""Held-out episodes in progress at a time."""
 
 
 @struct.dataclass
@@ -56,12 +58,12 @@ def evaluate(
     features = state_features(env, policy, params)
 
     def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
-        noise = policy.sample_noise(key, (episodes,))
+        noise = policy.sample_noise(key, actors.episode_return.shape[:1])
         noise = jax.tree.map(lambda x: jnp.where(greedy, 0.0, x), noise)
         carry, output = act(env, policy, params, features, actors, noise)
         return carry, output.action
 
-    return _play(env, choose, start(env, policy, held_out_keys(episodes)), key)
+    return _play(env, policy, choose, key, episodes)
 
 
 @partial(jax.jit, static_argnames=("env", "policy", "episodes"))
@@ -72,10 +74,10 @@ def evaluate_random(
     logits = jnp.where(jnp.asarray(env.action_mask), 0.0, -jnp.inf)
 
     def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
-        shape = (episodes, env.num_agents)
+        shape = actors.episode_return.shape
         return actors.carry, jax.random.categorical(key, logits, shape=shape).astype(jnp.int32)
 
-    return _play(env, choose, start(env, policy, held_out_keys(episodes)), key)
+    return _play(env, policy, choose, key, episodes)
 
 
 def shortest_path_steps(env: Environment, episodes: int = EPISODES) -> chex.Array | None:
@@ -86,29 +88,58 @@ def shortest_path_steps(env: Environment, episodes: int = EPISODES) -> chex.Arra
     return jax.jit(jax.vmap(lambda key: bound(env.reset(key))))(held_out_keys(episodes))
 
 
-def _play(env: Environment, choose: Any, actors: Actors, key: chex.PRNGKey) -> Evaluation:
-    """Steps all episodes until the last has ended; what ended keeps its figures."""
-    episodes = actors.episode_return.shape[0]
+@struct.dataclass
+class _Queue:
+    """Lanes that play one held-out episode after another. L lanes, 1 row per episode."""
+
+    actors: Actors  # leaves (L, ...)
+    episode: chex.Array  # (L,) int32 the episode a lane plays; past the last one: none
+    following: chex.Array  # () int32 the next episode to start
+    result: Evaluation
+    time: chex.Array  # () int32 steps so far, of all lanes
+
+
+def _play(
+    env: Environment, policy: Policy, choose: Any, key: chex.PRNGKey, episodes: int
+) -> Evaluation:
+    """Every held-out start, played to its end.
+
+    A team that gets stuck plays on to the step limit. Were all starts played side by side, it would
+    hold up everybody, so a lane whose episode ends takes the next start that is left.
+    """
+    keys = held_out_keys(episodes)
+    first = start(env, policy, keys[:LANES])
+    starts, lanes = jax.vmap(env.reset)(keys), first.episode_return.shape[0]
+
+    def unfinished(queue: _Queue) -> chex.Array:
+        return (queue.episode < episodes).any()
+
+    def body(queue: _Queue) -> _Queue:
+        actors = queue.actors
+        carry, actions = choose(actors, jax.random.fold_in(key, queue.time))
+        env_state, transition = jax.vmap(env.step)(actors.env_state, actions)
+        episode_return = actors.episode_return + transition.reward
+        done = transition.terminated | transition.truncated
+        now = Evaluation(transition.steps_taken, transition.success, episode_return.mean(-1))
+        # A row past the end is dropped.
+        row = jnp.where(done, queue.episode, episodes)
+        result = jax.tree.map(lambda x, y: x.at[row].set(y, mode="drop"), queue.result, now)
+        episode = jnp.where(done, queue.following + jnp.cumsum(done) - 1, queue.episode)
+        fresh = jax.tree.map(lambda x: x[jnp.minimum(episode, episodes - 1)], starts)
+        actors = Actors(
+            env_state=select(done, fresh, env_state),
+            carry=select(done, policy.initial_carry((lanes,)), carry),
+            episode_return=jnp.where(done[:, None], 0.0, episode_return),
+        )
+        return _Queue(actors, episode, queue.following + done.sum(), result, queue.time + 1)
+
     result = Evaluation(
         steps_taken=jnp.zeros(episodes, jnp.int32),
         success=jnp.zeros(episodes, bool),
         episode_return=jnp.zeros(episodes),
     )
-
-    def unfinished(loop: tuple) -> chex.Array:
-        return ~loop[2].all()
-
-    def body(loop: tuple) -> tuple:
-        actors, result, done, time = loop
-        carry, actions = choose(actors, jax.random.fold_in(key, time))
-        env_state, transition = jax.vmap(env.step)(actors.env_state, actions)
-        actors = Actors(env_state, carry, actors.episode_return + transition.reward)
-        now = Evaluation(transition.steps_taken, transition.success, actors.episode_return.mean(-1))
-        result = select(done, result, now)
-        return actors, result, done | transition.terminated | transition.truncated, time + 1
-
-    loop = (actors, result, jnp.zeros(episodes, bool), jnp.int32(0))
-    return jax.lax.while_loop(unfinished, body, loop)[1]
+    queue = _Queue(first, jnp.arange(lanes), jnp.int32(lanes), result, jnp.int32(0))
+    return jax.lax.while_loop(unfinished, body, queue).result
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sumajax import evaluation
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.evaluation import (
     EPISODES,
@@ -105,6 +106,15 @@ class TestGreedy:
         first, again, other = (played(seed, greedy=False) for seed in (0, 0, 1))
         jax.tree.map(np.testing.assert_array_equal, first, again)
         assert (first.episode_return != other.episode_return).any()
+
+    def test_however_few_are_played_at_a_time(self, monkeypatch):
+        """Greedy play draws nothing, so the lanes an episode waits for cannot matter."""
+        policy, params = tiny_policy()
+        monkeypatch.setattr(evaluation, "LANES", 3)
+        queued = jax.jit(evaluate.__wrapped__, static_argnums=(0, 1), static_argnames="episodes")(
+            TINY, policy, params, jax.random.key(0), episodes=FEW, greedy=True
+        )
+        jax.tree.map(np.testing.assert_array_equal, queued, played(greedy=True))
 
     def test_takes_the_likeliest_choice_at_every_step(self):
         policy, params = tiny_policy()
