@@ -39,7 +39,7 @@ def hetnet(
     weight = jnp.where(valid[..., None], jnp.ones_like(trajectory.value), 0)
     raw = estimate_advantages(trajectory, last_value, config)
     advantages = normalise_by_class(raw, valid, episodes * trajectory.max_steps, peers)
-    policy, entropy, _ = policy_gradient(trajectory.decisions, advantages, weight / episodes)
+    policy, entropy = policy_gradient(trajectory.decisions, advantages, weight / episodes)
     target = jax.lax.stop_gradient(trajectory.value) + raw
     error = ((trajectory.value - target) @ (peers / size)) ** 2  # each agent has its class's
     critic = (weight * error / size / episode_length(trajectory)[..., None] / episodes).sum()
@@ -48,7 +48,7 @@ def hetnet(
         + config.value_weight * critic
         - config.entropy_weight * entropy_scale * entropy
     )
-    summed, _, action_entropy = policy_gradient(trajectory.decisions, advantages, weight)
+    summed, action_entropy = policy_gradient(trajectory.decisions, advantages, weight)
     return loss, LossParts(summed, (weight * error).sum(), action_entropy, weight.sum())
 
 

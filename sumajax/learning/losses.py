@@ -73,17 +73,22 @@ ADVANTAGES: dict[str, Callable[[chex.Array, chex.Array, str | None], chex.Array]
 
 
 def policy_gradient(
-    decisions: dict[str, Decision], advantages: chex.Array, weight: chex.Array
-) -> tuple[chex.Array, chex.Array, chex.Array]:
-    """() sum of -weight * advantage * log pi(choices); entropy sums: all decisions, the action.
+    decisions: dict[str, Decision],
+    advantages: chex.Array,
+    weight: chex.Array,
+    acting: chex.Array | None = None,
+) -> tuple[chex.Array, chex.Array]:
+    """() sum of -weight * advantage * log pi(choices), () sum of the action's entropy.
 
-    Every decision of an agent (its action, its gate) shares the advantage, a constant here.
+    Every decision of an agent (its action, its gate) shares the advantage, a constant here. Those
+    beside the action still count where `acting` leaves the action out: an agent that has arrived
+    can move no more, but what it says can send the others the right way.
     """
+    acting = weight if acting is None else acting
     pairs = {name: log_prob_and_entropy(decision) for name, decision in decisions.items()}
-    log_prob = sum(taken for taken, _ in pairs.values())
-    loss = -(weight * jax.lax.stop_gradient(advantages) * log_prob).sum()
-    entropies = {name: (weight * entropy).sum() for name, (_, entropy) in pairs.items()}
-    return loss, sum(entropies.values(), jnp.float32(0)), entropies["action"]
+    weighted = sum((acting if name == "action" else weight) * pairs[name][0] for name in pairs)
+    loss = -(jax.lax.stop_gradient(advantages) * weighted).sum()
+    return loss, (acting * pairs["action"][1]).sum()
 
 
 def estimate_advantages(
@@ -115,7 +120,7 @@ def actor_critic(
     """Policy gradient with a learnt baseline.
 
     sum of -advantage * log pi + value_weight (V - R)^2 - entropy_weight H, with R the advantage
-    plus V, or with `team_reward` partly the team's mean of it.
+    plus V, or with `team_reward` partly the team's mean of it, and H the entropy of the action.
 
     Args:
       valid: (T, E), 0 for steps that must not count.
@@ -132,11 +137,11 @@ def actor_critic(
     advantages = target - value
     acting = weight * trajectory.active if config.mask_inactive else weight
     advantages = ADVANTAGES[config.advantages](advantages, acting, axis)
-    policy, entropy, action_entropy = policy_gradient(trajectory.decisions, advantages, acting)
+    policy, entropy = policy_gradient(trajectory.decisions, advantages, weight, acting)
     critic = (weight * (trajectory.value - target) ** 2).sum()
     loss = (
         config.policy_weight * policy
         + config.value_weight * critic
         - config.entropy_weight * entropy_scale * entropy
     )
-    return loss, LossParts(policy, critic, action_entropy, acting.sum())
+    return loss, LossParts(policy, critic, entropy, acting.sum())

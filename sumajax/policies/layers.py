@@ -92,37 +92,31 @@ class LSTMCell(nn.Module):
 def lstm_gates(z: chex.Array, s: chex.Array) -> tuple[chex.Array, chex.Array]:
     """Pre-activations (..., 4H) in blocks i, f, g, o and cell (..., H) -> the next (h, s).
 
-    Its derivative is written out, so that a scan keeps three arrays for the way back instead of a
-    dozen, which on a CPU is time spent copying.
+    Its derivative is written out, so that a scan keeps six arrays for the way back instead of a
+    dozen, and has only products left to do there.
     """
     return _lstm_gates_forward(z, s)[0]
 
 
+def _sigmoid(z: chex.Array) -> chex.Array:
+    """By the hyperbolic tangent, which XLA makes of fewer instructions than an exponential."""
+    return 0.5 * jnp.tanh(0.5 * z) + 0.5
+
+
 def _lstm_gates_forward(z: chex.Array, s: chex.Array) -> tuple[Any, Any]:
     i, f, g, o = jnp.split(z, 4, axis=-1)
-    gates = jnp.concatenate(
-        [jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)], axis=-1
-    )
-    i, f, g, o = jnp.split(gates, 4, axis=-1)
+    i, f, g, o = _sigmoid(i), _sigmoid(f), jnp.tanh(g), _sigmoid(o)
     next_s = f * s + i * g
     squashed = jnp.tanh(next_s)
-    return (o * squashed, next_s), (gates, s, squashed)
+    slopes = (g * i * (1 - i), s * f * (1 - f), i * (1 - g**2), squashed * o * (1 - o))
+    return (o * squashed, next_s), (*slopes, f, o * (1 - squashed**2))
 
 
 def _lstm_gates_backward(kept: Any, cotangents: Any) -> tuple[chex.Array, chex.Array]:
-    (gates, s, squashed), (d_h, d_next_s) = kept, cotangents
-    i, f, g, o = jnp.split(gates, 4, axis=-1)
-    d_s = d_next_s + d_h * o * (1 - squashed**2)
-    d_z = jnp.concatenate(
-        [
-            d_s * g * i * (1 - i),
-            d_s * s * f * (1 - f),
-            d_s * i * (1 - g**2),
-            d_h * squashed * o * (1 - o),
-        ],
-        axis=-1,
-    )
-    return d_z, d_s * f
+    (slope_i, slope_f, slope_g, slope_o, f, through), (d_h, d_next_s) = kept, cotangents
+    d_s = d_next_s + d_h * through
+    d_z = [d_s * slope_i, d_s * slope_f, d_s * slope_g, d_h * slope_o]
+    return jnp.concatenate(d_z, axis=-1), d_s * f
 
 
 lstm_gates.defvjp(_lstm_gates_forward, _lstm_gates_backward)

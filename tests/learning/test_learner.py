@@ -121,7 +121,8 @@ class TestGradient:
             def loss(params):
                 _, seen = rollout(env, tiny.policy, params, actors, draws)
                 advantages, acting = target - now.value, now.active.astype(float)
-                policy, entropy, _ = policy_gradient(seen.decisions, advantages, acting)
+                everyone = jnp.ones_like(acting)
+                policy, entropy = policy_gradient(seen.decisions, advantages, everyone, acting)
                 critic = ((seen.value - target) ** 2).sum()
                 weights = tiny.config.value_weight, tiny.config.entropy_weight
                 return policy + weights[0] * critic - weights[1] * entropy

@@ -63,8 +63,11 @@ def slow_loss(trajectory, valid, last_value, config, logits, value):
     for name, decision in trajectory.decisions.items():
         log_prob = log_softmax(logits[name])
         taken = np.take_along_axis(log_prob, np.asarray(decision.choice)[..., None], -1)[..., 0]
-        policy -= (advantages * taken)[acts].sum()
-        entropy -= (np.exp(log_prob) * log_prob).sum(-1)[acts].sum()
+        if name == "action":
+            policy -= (advantages * taken)[acts].sum()
+            entropy -= (np.exp(log_prob) * log_prob).sum(-1)[acts].sum()
+        else:  # what an agent says still counts when it moves no more
+            policy -= (advantages * taken)[counts].sum()
     critic = ((value - target) ** 2)[counts].sum()
     bonus = config.entropy_weight * ENTROPY_SCALE * entropy
     return config.policy_weight * policy + config.value_weight * critic - bonus
