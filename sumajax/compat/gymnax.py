@@ -19,7 +19,7 @@ from sumajax.environments.types import Environment, Observation
 if importlib.util.find_spec("gymnax") is not None:
     from gymnax.environments import spaces
 else:
-    from sumajax.compat import spaces  # type: ignore[no-redef]
+    from sumajax.compat import spaces
 
 
 @struct.dataclass

@@ -24,12 +24,14 @@ from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.environments.types import Environment
 from sumajax.upsampling import StateUpsampled
 
-MultiAgentEnv: Any = object
 if importlib.util.find_spec("jaxmarl") is not None:
-    from jaxmarl.environments import spaces
-    from jaxmarl.environments.multi_agent_env import MultiAgentEnv
+    from jaxmarl.environments import multi_agent_env, spaces
+
+    Base: Any = multi_agent_env.MultiAgentEnv
 else:
-    from sumajax.compat import spaces  # type: ignore[no-redef]
+    from sumajax.compat import spaces
+
+    Base = object
 
 TASKS: dict[str, type[PredatorCapturePrey]] = {
     "sumajax_predator_prey": PredatorPrey,
@@ -47,7 +49,7 @@ class State:
     step: chex.Array  # () int32 steps taken so far
 
 
-class JaxMARLEnv(MultiAgentEnv):  # type: ignore[misc]
+class JaxMARLEnv(Base):
     """A task behind JaxMARL's `MultiAgentEnv` interface.
 
     Agents are `agent_0` and so on, predators first. An observation is one flat float32 vector, as
