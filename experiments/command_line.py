@@ -14,6 +14,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import jax
 import tyro
+from config_file import NOTE, with_config_file
 from transfer_run import TransferConfig, run_experiment
 
 from sumajax.learning import parallel, preset
@@ -31,10 +32,11 @@ GOES_ON = "stopped; the same command goes on from the last checkpoint."
 def main(experiment: type[TransferConfig]) -> None:
     """Reads the options of a transfer experiment and runs it."""
     with plain_errors():
-        chosen = _presets(experiment, sys.argv[1:])
+        arguments = with_config_file(experiment, sys.argv[1:])
+        chosen = _presets(experiment, arguments)
         # The subclass gives both tasks a default.
         default = experiment(learner=preset(chosen.preset, chosen.policy))  # type: ignore[call-arg]
-        config = parse(experiment, default)
+        config = parse(experiment, default, arguments, NOTE)
         prepare_jax(config.num_devices)
         if run_experiment(config).get("stops"):
             raise SystemExit(STOPPED)
@@ -67,8 +69,14 @@ def prepare_jax(devices: int) -> None:
         jax.config.update("jax_compilation_cache_dir", str(CACHE))
 
 
-def parse(options: type[Options], default: Options) -> Options:
+def parse(
+    options: type[Options], default: Options, arguments: list[str] | None = None, note: str = ""
+) -> Options:
     """The command line as `options`; a mistake, which the parser draws in a box, is one sentence.
+
+    Args:
+      arguments: None takes those of the program.
+      note: added to what `--help` says first.
 
     Raises:
       ValueError: for what is no such option or value.
@@ -76,7 +84,13 @@ def parse(options: type[Options], default: Options) -> Options:
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(options, default=default, registry=_REGISTRY)
+            return tyro.cli(
+                options,
+                args=arguments,
+                default=default,
+                description=f"{inspect.getdoc(options)}\n\n{note}".strip(),
+                registry=_REGISTRY,
+            )
     except SystemExit as stop:
         if stop.code:
             raise ValueError(_sentence(said.getvalue())) from None

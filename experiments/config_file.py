@@ -1,0 +1,74 @@
+"""Options from the config.json that a run leaves, so that the run can be repeated from it.
+
+The file becomes arguments of the command line, ahead of those that were given: the parser checks
+both alike, and what is given by hand comes on top.
+"""
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
+
+MAX_BYTES = 2**20
+NOTE = (
+    "--config FILE takes the options from the config.json of a run (all but where it was written); "
+    "options beside it come on top."
+)
+
+
+def with_config_file(experiment: type, arguments: list[str]) -> list[str]:
+    """`arguments` with those of `--config FILE` in its place, ahead of the others.
+
+    Raises:
+      ValueError: for a file that is not of a run, or of a run of another experiment.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--config", type=Path)
+    try:
+        chosen, rest = parser.parse_known_args(arguments)
+    except argparse.ArgumentError:
+        raise ValueError("config takes one file, the config.json of a run.") from None
+    if chosen.config is None:
+        return rest
+    options = _read(chosen.config)
+    options.pop("output", None)
+    return [*_arguments(options, experiment, chosen.config), *rest]
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        with open(file, "rb") as opened:
+            text = opened.read(MAX_BYTES + 1)
+        options: Any = json.loads(text)["options"] if len(text) <= MAX_BYTES else None
+    except OSError as error:
+        raise ValueError(f"{file} cannot be read ({error.strerror}).") from None
+    except (ValueError, KeyError, TypeError, RecursionError):
+        options = None
+    if not isinstance(options, dict):
+        raise ValueError(f"{file} is no config.json of a run.")
+    return options
+
+
+def _arguments(options: dict[str, Any], cls: type, file: Path, prefix: str = "") -> Iterator[str]:
+    """The options of `cls` as arguments; those its class fixes must have the fixed value."""
+    types = get_type_hints(cls)
+    fixed = {field.name: field.default for field in fields(cls) if not field.init}
+    for name, value in options.items():
+        if name in fixed:
+            if value != fixed[name]:
+                raise ValueError(
+                    f"{file} has {prefix}{name} {value}, which is always {fixed[name]} in this "
+                    "experiment; use the program that wrote it."
+                )
+            continue
+        option = f"--{prefix}{name}".replace("_", "-")
+        inner = types.get(name)
+        if isinstance(value, dict) and isinstance(inner, type) and is_dataclass(inner):
+            yield from _arguments(value, inner, file, f"{prefix}{name}.")
+        elif isinstance(value, bool):
+            yield option if value else f"--{prefix}no-{name}".replace("_", "-")
+        else:
+            yield option
+            yield from map(str, value if isinstance(value, list) else [value])
