@@ -8,6 +8,7 @@ import io
 import json
 import os
 import platform
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -209,6 +210,9 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
         ) from None
     try:
         _check_directory(directory, described)
+        for path in directory.iterdir():
+            if _LEFTOVER.fullmatch(path.name):
+                path.unlink()
         reporting.write_json(
             directory / "config.json",
             {"command": sys.argv, "options": described, "versions": _versions()},
@@ -218,12 +222,16 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
         lock.release()
 
 
+_LEFTOVER = re.compile(r"\..+\.\d+\.tmp")
+"""What a writer that was killed leaves of a file."""
+
+
 def _check_directory(directory: Path, described: dict[str, Any]) -> None:
     file = directory / "config.json"
     if not file.exists():
         is_there = directory.is_dir()
         others = sorted(path.name for path in directory.iterdir()) if is_there else []
-        others = [name for name in others if name != ".lock"]
+        others = [name for name in others if name != ".lock" and not _LEFTOVER.fullmatch(name)]
         if others:
             raise ValueError(
                 f"{directory} exists and holds {others[0]!r}, not a run; choose another --output."
@@ -254,7 +262,8 @@ class Recorder:
         self.arms: dict[str, dict[str, Any]] = {}
         self.zero_shot: dict[str, dict[str, Any]] = {}
         self.params: dict[str, Any] = {}
-        self._cost: dict[str, tuple[int, float]] = {}  # env steps and seconds of an arm so far
+        self.stops: dict[str, list[dict[str, Any]]] = {}
+        self._cost: dict[str, tuple[np.ndarray, float]] = {}  # env steps (S,), seconds so far
 
     def train(self, arm: str, start: Callable[[], TrainState]) -> None:
         """Trains an arm to its end, a row per seed and epoch on the way, and evaluates it."""
@@ -262,7 +271,7 @@ class Recorder:
         done = saved_epoch(stage)
         metrics_file.truncate_after(self.metrics, arm, done)
         _truncate_evaluations(self.evaluations, arm, done)
-        self._cost[arm] = _cost_so_far(self.metrics, arm)
+        self._cost[arm] = _cost_so_far(self.metrics, stage)
         self.progress.begin(arm, done)
         config = self.run.config
         result = run_stage(
@@ -272,11 +281,14 @@ class Recorder:
             meta={"experiment": config.experiment, "preset": config.preset},
             on_chunk=lambda chunk: self._record(stage, chunk),
             on_resume=lambda epoch: self.progress.say(f"{arm}: going on from epoch {epoch}."),
+            on_stop=lambda stop: self.progress.say(f"{arm}: {stop}."),
         )
         self.params[arm] = result.states.params
+        if result.stops:
+            self.stops[arm] = [asdict(stop) for stop in result.stops]
         env_steps, seconds = self._cost[arm]
         self.arms[arm] = metrics_file.arm_summary(
-            env_steps=env_steps,
+            env_steps=int(env_steps.mean()),
             epochs=stage.epochs,
             compile_seconds=result.compile_seconds,
             train_seconds=seconds,
@@ -315,6 +327,7 @@ class Recorder:
             "comparison": metrics_file.comparison(rows, config.threshold),
             "zero_shot_greedy": self.zero_shot.get("greedy"),
             "references": references,
+            **({"stops": self.stops} if self.stops else {}),
         }
         metrics_file.write_summary(self.directory / "summary.json", **summary)
         return summary
@@ -323,14 +336,14 @@ class Recorder:
         """Rows, a held-out evaluation where one is due, and progress."""
         arm, count = stage.arm, chunk.epoch - chunk.first_epoch
         steps, seconds = self._cost[arm]
-        env_steps = steps + np.cumsum(np.asarray(chunk.metrics.env_steps), axis=-1)
+        env_steps = steps[:, None] + np.cumsum(np.asarray(chunk.metrics.env_steps), axis=-1)
         clock = seconds + chunk.seconds * np.arange(1, count + 1) / count
         values = {name: getattr(chunk.metrics, name) for name in _FIGURES}
         values |= {"return": chunk.metrics.episode_return, "env_steps": env_steps, "seconds": clock}
         metrics_file.append_rows(
             self.metrics, metrics_file.rows_of(arm, stage.seeds, chunk.first_epoch + 1, values)
         )
-        self._cost[arm] = (int(env_steps[:, -1].mean()), seconds + chunk.seconds)
+        self._cost[arm] = (env_steps[:, -1], seconds + chunk.seconds)
         every = self.run.config.evaluate_every
         if arm != SOURCE and every and chunk.epoch // every > chunk.first_epoch // every:
             held_out = _evaluation(
@@ -338,8 +351,8 @@ class Recorder:
             )
             _append_evaluation(self.evaluations, stage, chunk.epoch, env_steps[:, -1], held_out)
         latest = {
-            "steps_taken": float(np.nanmean(chunk.metrics.steps_taken[:, -1])),
-            "success": float(np.nanmean(chunk.metrics.success[:, -1])),
+            "steps_taken": _mean(chunk.metrics.steps_taken[:, -1]),
+            "success": _mean(chunk.metrics.success[:, -1]),
             "env_steps_per_second": len(stage.seeds) * count * EPOCH_STEPS / chunk.seconds,
         }
         self.progress.advance(arm, chunk.epoch, latest)
@@ -364,6 +377,12 @@ _FIGURES = (
     "communication",
 )
 """Columns of metrics.csv that are fields of `Metrics` by the same name."""
+
+
+def _mean(values: np.ndarray) -> float:
+    """Over those that are numbers; NaN if none is."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else float("nan")
 
 
 def _evaluation(env: Environment, policy: Policy, params: Any, greedy: bool) -> dict[str, Any]:
@@ -413,15 +432,12 @@ def _levels(reference: dict[str, Any]) -> dict[str, float]:
     return {name: round(value, 1) for name, value in levels.items() if value is not None}
 
 
-def _cost_so_far(metrics: Path, arm: str) -> tuple[int, float]:
-    """Environment steps of a seed, and seconds, in the rows an earlier run left."""
-    if not metrics.exists():
-        return 0, 0.0
-    rows = [row for row in metrics_file.read_metrics(metrics) if row["arm"] == arm]
-    last = [row for row in rows if row["epoch"] == max(r["epoch"] for r in rows)]
-    if not last:
-        return 0, 0.0
-    return int(np.mean([row["env_steps"] for row in last])), last[0]["seconds"]
+def _cost_so_far(metrics: Path, stage: Stage) -> tuple[np.ndarray, float]:
+    """(S,) environment steps of each seed, and seconds, in the rows an earlier run left."""
+    rows = metrics_file.read_metrics(metrics) if metrics.exists() else []
+    last = {row["seed"]: row for row in rows if row["arm"] == stage.arm}  # in order of epochs
+    env_steps = [last[seed]["env_steps"] if last else 0 for seed in stage.seeds]
+    return np.array(env_steps, int), last[stage.seeds[0]]["seconds"] if last else 0.0
 
 
 EVALUATION_COLUMNS = ("arm", "seed", "epoch", "env_steps", "steps_taken", "success", "return")
@@ -507,7 +523,9 @@ def table(run: Run, summary: dict[str, Any]) -> list[dict[str, Any]]:
     for arm, result in summary["arms"].items():
         task = grid["source" if arm == SOURCE else "target"]
         cost = {"steps": result["env_steps"], "seconds": result["train_seconds"]}
-        rows.append(_row(arm, task, result["evaluation"], **cost))
+        stops = [f"seed {stop['seed']} stopped" for stop in summary.get("stops", {}).get(arm, [])]
+        name = f"{arm} ({', '.join(stops)})" if stops else arm
+        rows.append(_row(name, task, result["evaluation"], **cost))
         if arm == SOURCE and summary["zero_shot"]:
             evaluation = {"sampled": summary["zero_shot"], "greedy": summary["zero_shot_greedy"]}
             rows.append(_row("zero shot", grid["target"], evaluation))

@@ -6,17 +6,19 @@ checkpoints from which it goes on when it is started again, and from which a tar
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 
 from sumajax import checkpoint
 from sumajax.checkpoint import CheckpointError
 from sumajax.learning import parallel
+from sumajax.learning.guard import FAULTS
 from sumajax.learning.learner import Learner, Metrics, TrainState
 
 CHUNK = 5
@@ -40,6 +42,25 @@ class Stage:
 
 
 @dataclass(frozen=True)
+class Stop:
+    """A seed that went no further because a number of its training was not finite any more."""
+
+    seed: int
+    epoch: int  # in which it happened, counted from 1
+    fault: str  # one of `guard.FAULTS`
+
+    def __str__(self) -> str:
+        return (
+            f"seed {self.seed} stopped in epoch {self.epoch}: its {self.fault}; "
+            "the last good state is kept"
+        )
+
+
+class StoppedError(ValueError):
+    """Every seed of a stage has stopped."""
+
+
+@dataclass(frozen=True)
 class StageResult:
     """What came of it: the last states, stacked over seeds, and what this run of it cost."""
 
@@ -47,6 +68,7 @@ class StageResult:
     first_epoch: int  # epochs that an earlier run had done
     compile_seconds: float
     train_seconds: float
+    stops: tuple[Stop, ...] = ()  # seeds whose last state is of an earlier epoch
 
 
 @dataclass(frozen=True)
@@ -118,6 +140,7 @@ def run_stage(
     meta: dict[str, Any] | None = None,
     on_chunk: Callable[[Chunk], None] = lambda chunk: None,
     on_resume: Callable[[int], None] = lambda epoch: None,
+    on_stop: Callable[[Stop], None] = lambda stop: None,
     chunk: int = CHUNK,
 ) -> StageResult:
     """Trains the stage to its end, from its last checkpoint if it has one, else from `start()`.
@@ -128,10 +151,14 @@ def run_stage(
       on_chunk: called after every chunk, before its checkpoint is written: what it writes may be
         ahead of the checkpoints when a run is killed, and cut back, but is never behind.
       on_resume: called first with the epoch that training goes on from.
+      on_stop: called once for each seed that stops; the others go on.
+
+    Raises:
+      StoppedError: when the last seed has stopped; its checkpoint is written.
     """
     num_seeds, num_envs = len(stage.seeds), stage.learner.config.num_envs
     mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
-    first_epoch, states = _resumed(stage, start)
+    first_epoch, states, stops = _resumed(stage, start)
     if first_epoch:
         on_resume(first_epoch)
     states = parallel.place(states, mesh)
@@ -148,6 +175,8 @@ def run_stage(
     train: parallel.Train | None = None
     length = _chunk_length(stage.epochs, first_epoch, chunk)
     for epoch in range(first_epoch, stage.epochs, length):
+        if len(stops) == num_seeds:
+            break
         if train is None:
             began = time.perf_counter()
             train = parallel.compile_train(stage.learner, mesh, length, states)
@@ -158,8 +187,34 @@ def run_stage(
         train_seconds += seconds
         done = epoch + length
         on_chunk(Chunk(epoch, done, states, jax.device_get(metrics), seconds))
-        checkpoint.save(stage.directory, states, {**description, "epoch": done})
-    return StageResult(states, first_epoch, compile_seconds, train_seconds)
+        for stop in _new_stops(stage, states, metrics, stops):
+            on_stop(stop)
+            stops += (stop,)
+        told = {**description, "epoch": done, "stops": [asdict(stop) for stop in stops]}
+        checkpoint.save(stage.directory, states, told)
+    if len(stops) == num_seeds:
+        raise StoppedError(
+            f"no seed of the {stage.arm} stage is left ({stops[0]}); try a lower learning rate or "
+            "max_grad_norm in another directory."
+        )
+    return StageResult(states, first_epoch, compile_seconds, train_seconds, stops)
+
+
+def _new_stops(
+    stage: Stage, states: TrainState, metrics: Metrics, known: tuple[Stop, ...]
+) -> list[Stop]:
+    """Seeds that have stopped; the number of updates they have taken says when."""
+    stopped = {stop.seed for stop in known}
+    faults, updates = (np.asarray(x) for x in jax.device_get((metrics.fault, states.updates)))
+    return [
+        Stop(
+            seed,
+            int(updates[i]) // stage.learner.config.updates_per_epoch + 1,
+            FAULTS[faults[i, -1] - 1],
+        )
+        for i, seed in enumerate(stage.seeds)
+        if faults[i, -1] and seed not in stopped
+    ]
 
 
 def saved_epoch(stage: Stage) -> int:
@@ -169,15 +224,25 @@ def saved_epoch(stage: Stage) -> int:
     return checkpoint.read_meta(stage.directory)["epoch"]
 
 
-def _resumed(stage: Stage, start: Callable[[], TrainState]) -> tuple[int, TrainState]:
+def _resumed(
+    stage: Stage, start: Callable[[], TrainState]
+) -> tuple[int, TrainState, tuple[Stop, ...]]:
     if checkpoint.latest(stage.directory) is None:
-        return 0, start()
+        return 0, start(), ()
     like = jax.eval_shape(lambda: fresh_states(stage))
     states, meta = checkpoint.load(stage.directory, like)
-    return meta["epoch"], jax.tree.map(jnp.asarray, states)
+    stops = tuple(Stop(**stop) for stop in meta.get("stops", []))
+    return meta["epoch"], jax.tree.map(jnp.asarray, states), stops
 
 
 def _chunk_length(epochs: int, done: int, longest: int) -> int:
-    """The longest chunk that reaches the end in equal parts, so that one program is compiled."""
-    left = epochs - done
-    return max((n for n in range(1, longest + 1) if left % n == 0), default=1)
+    """The longest chunk that reaches the end in equal parts, so that one program is compiled.
+
+    A resumed stage takes the chunks of an uninterrupted one: other chunks are other programs, and
+    look at the policy in other epochs.
+    """
+    for left in (epochs, epochs - done):
+        length = max((n for n in range(1, longest + 1) if left % n == 0), default=1)
+        if done % length == 0:
+            return length
+    return 1

@@ -1,15 +1,28 @@
 """Source stage -> checkpoint -> target stage: what carries over, what does not, what is refused."""
 
+from dataclasses import replace
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sumajax import checkpoint
 from sumajax.checkpoint import CheckpointError
 from sumajax.environments import PredatorPrey
-from sumajax.learning import LearnerConfig, make_learner
+from sumajax.learning import LearnerConfig, make_learner, parallel
+from sumajax.learning.guard import FAULTS
+from sumajax.learning.learner import Metrics
 from sumajax.policies import make_policy
-from sumajax.transfer import Stage, _chunk_length, fresh_states, run_stage, transferred_states
+from sumajax.transfer import (
+    Stage,
+    Stop,
+    StoppedError,
+    _chunk_length,
+    fresh_states,
+    run_stage,
+    transferred_states,
+)
 from sumajax.upsampling import StateUpsampled
 
 SOURCE = StateUpsampled(PredatorPrey(size=3, num_predators=2, max_steps=10), 6)
@@ -99,7 +112,63 @@ def test_a_finished_stage_is_not_run_again(source):
 
 @pytest.mark.parametrize(
     ("epochs", "done", "longest", "expected"),
-    [(125, 0, 5, 5), (7, 0, 5, 1), (12, 0, 5, 4), (125, 120, 5, 5), (3, 0, 5, 3), (5, 5, 5, 5)],
+    [
+        (125, 0, 5, 5),
+        (7, 0, 5, 1),
+        (12, 0, 5, 4),
+        (125, 120, 5, 5),
+        (3, 0, 5, 3),
+        (5, 5, 5, 5),
+        (18, 0, 5, 3),
+        (18, 3, 5, 3),  # as before the interruption, though 15 are left
+        (18, 4, 5, 2),
+    ],
 )
 def test_chunks_reach_the_end_in_equal_parts(epochs, done, longest, expected):
     assert _chunk_length(epochs, done, longest) == expected
+
+
+def train_until(ends, learner):
+    """Stands for training in which seed i goes no further than `ends[i]` updates."""
+    each = learner.config.updates_per_epoch
+
+    def compile_train(learner, mesh, epochs, states):
+        def train(states):
+            wanted = np.asarray(states.updates) + each * epochs
+            updates = np.minimum(wanted, ends)
+            fault = np.where(updates < wanted, 1 + FAULTS.index("gradient became NaN"), 0)
+            figures = dict.fromkeys(Metrics.__dataclass_fields__, np.zeros((len(ends), epochs)))
+            metrics = Metrics(**figures | {"fault": np.tile(fault[:, None], epochs)})
+            return states.replace(updates=jnp.asarray(updates)), metrics
+
+        return train
+
+    return compile_train
+
+
+def test_a_seed_that_stops_is_told_of_once_and_the_others_go_on(tmp_path, monkeypatch):
+    chosen = stage(SOURCE, tmp_path, seeds=(4, 9), epochs=4)
+    each = chosen.learner.config.updates_per_epoch
+    ends = [10**6, each + 3]
+    monkeypatch.setattr(parallel, "compile_train", train_until(ends, chosen.learner))
+    said = []
+
+    def run(epochs):
+        longer = replace(chosen, epochs=epochs)
+        start = lambda: fresh_states(longer)  # noqa: E731
+        return run_stage(longer, start, on_stop=lambda stop: said.append(str(stop)), chunk=1)
+
+    stopped = (Stop(9, 2, "gradient became NaN"),)
+    sentence = "seed 9 stopped in epoch 2: its gradient became NaN; the last good state is kept"
+    result = run(4)
+    assert result.stops == stopped
+    assert said == [sentence]
+    assert result.states.updates.tolist() == [4 * each, each + 3]
+    again = run(5)  # as after an interruption
+    assert (again.first_epoch, again.stops, said) == (4, stopped, [sentence])
+    ends[0] = 5 * each + 1
+    for _ in range(2):
+        with pytest.raises(StoppedError, match=f"no seed of the source stage is left .{sentence}"):
+            run(9)
+    assert len(said) == 2
+    assert checkpoint.read_meta(tmp_path)["epoch"] == 6, "nothing is trained in vain"

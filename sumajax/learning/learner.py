@@ -11,6 +11,7 @@ import optax
 from flax import struct
 
 from sumajax.environments.types import Environment
+from sumajax.learning import guard
 from sumajax.learning.config import LearnerConfig
 from sumajax.learning.hetnet_loss import hetnet
 from sumajax.learning.losses import LossFunction, LossParts, actor_critic
@@ -49,7 +50,8 @@ class Tally:
     agent_steps: chex.Array  # () int32
     loss: LossParts
     gradient_norm: chex.Array  # () float32 over updates
-    updates: chex.Array  # () int32
+    updates: chex.Array  # () int32 taken
+    faults: chex.Array  # (FAULTS,) int32 updates refused, by reason; see `guard`
 
 
 @struct.dataclass
@@ -66,6 +68,7 @@ class Metrics:
     value_loss: chex.Array  # () float32 squared error per agent and step
     gradient_norm: chex.Array  # () float32 before clipping, mean over updates
     communication: chex.Array  # () float32 in [0, 1]
+    fault: chex.Array  # () int32: 0, or what stopped the seed, 1 + its place in `guard.FAULTS`
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,8 @@ class Learner:
         """One rollout and one optimiser step.
 
         The gradient is that of the loss summed over agents and steps, divided by the number of
-        environment steps (algorithms.md 4.1).
+        environment steps (algorithms.md 4.1). An update that is not finite is refused: the state
+        stays as it is, and of the tally only the fault is left.
         """
         grads, (actors, tally) = self._gradient(state.params, *self._inputs(state), state.updates)
         grads, tally = self._over_devices((grads, tally))
@@ -127,7 +131,11 @@ class Learner:
         next_state = replace(
             state, params=params, opt_state=opt_state, actors=actors, updates=state.updates + 1
         )
-        return next_state, tally
+        loss = tally.loss.policy + tally.loss.value + tally.loss.entropy
+        faults = guard.faults_of(loss, tally.gradient_norm, params)
+        nothing = jax.tree.map(jnp.zeros_like, tally)
+        next_state, tally = guard.unless(faults, (next_state, tally), (state, nothing))
+        return next_state, replace(tally, faults=faults)
 
     def _inputs(self, state: TrainState) -> tuple[Actors, Draws]:
         """Where an update's rollout starts, and all its random numbers."""
@@ -228,6 +236,7 @@ def tally_of(trajectory: Trajectory, valid: chex.Array, parts: LossParts) -> Tal
         loss=jax.lax.stop_gradient(parts),
         gradient_norm=jnp.float32(0),
         updates=jnp.int32(1),
+        faults=jnp.zeros(len(guard.FAULTS), jnp.int32),
     )
 
 
@@ -244,6 +253,7 @@ def summarise(tally: Tally) -> Metrics:
         value_loss=tally.loss.value / tally.agent_steps,
         gradient_norm=tally.gradient_norm / tally.updates,
         communication=tally.communication / tally.env_steps,
+        fault=guard.first_fault(tally.faults),
     )
 
 

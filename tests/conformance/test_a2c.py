@@ -218,7 +218,7 @@ def batch_results(learner: RecordedLearner, params: Any) -> Arrays:
 def update_results(learner: RecordedLearner, state: TrainState) -> tuple[TrainState, Arrays]:
     """The state after an update, and its `out.*` and `grad.*` (`grad.x` of the whole file)."""
     results = batch_results(learner, state.params)
-    next_state, tally = learner.update(state)
+    next_state, tally = learner.update(state.replace(actors=learner.given[0]))
     grads = jax.tree.map(lambda g: g / tally.env_steps, learner.gradients.pop()["params"])
     results |= dotted(grads["core"], "grad.") | {"grad.x": grads["observation"]["x"]}
     return next_state.replace(actors=None), results

@@ -91,6 +91,16 @@ def test_a_run_from_start_to_end(toy, capsys):
         assert row in table
 
 
+def test_the_table_marks_a_seed_that_stopped(toy):
+    summary = json.loads((toy.directory / "summary.json").read_text())
+    arms = {arm: summary[arm] for arm in ("source", "transfer", "scratch")}
+    stops = {"transfer": [{"seed": 1, "epoch": 12, "fault": "gradient became NaN"}]}
+    rows = transfer_run.table(transfer_run.Run.of(toy), {**summary, "arms": arms, "stops": stops})
+    names = [row["policy"] for row in rows]
+    assert "transfer (seed 1 stopped) 6x6" in names
+    assert "scratch 6x6" in names
+
+
 def test_a_finished_run_is_not_overwritten(toy):
     before = (toy.directory / "summary.json").read_bytes()
     with pytest.raises(ValueError, match="holds a finished run"):
