@@ -21,6 +21,7 @@ from typing import Any, ClassVar, Literal
 import jax
 import numpy as np
 from filelock import FileLock, Timeout
+from interrupt import stop_when_asked
 from jax.sharding import Mesh
 
 from sumajax import checkpoint, reporting
@@ -30,6 +31,7 @@ from sumajax.evaluation import EPISODES, evaluate, evaluate_random, shortest_pat
 from sumajax.learning import EPOCH_STEPS, LearnerConfig, TrainState, make_learner, parallel
 from sumajax.policies import Policy, make_policy
 from sumajax.reporting import metrics as metrics_file
+from sumajax.reporting.loggers import LoggerName, Loggers, check_installed
 from sumajax.transfer import (
     Chunk,
     Stage,
@@ -85,6 +87,8 @@ class TransferConfig:
     """Steps taken that count as solved in the comparison."""
     devices: int | None = None
     """CPU devices to spread seeds and environments over; None: all that they spread over."""
+    log: tuple[LoggerName, ...] = ()
+    """Where to show the metrics beside metrics.csv: tensorboard, wandb."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     """The learner's settings; what is not given comes from the preset."""
 
@@ -140,6 +144,7 @@ class Run:
     @classmethod
     def of(cls, config: TransferConfig) -> "Run":
         """Builds both tasks and policies, and refuses what cannot be transferred."""
+        check_installed(config.log)
         source = StateUpsampled(config.source, config.target.size, config.scale)
         policies = [make_policy(config.policy, env) for env in (source, config.target)]
         run = cls(config, source, *policies)
@@ -255,8 +260,11 @@ def _check_directory(directory: Path, described: dict[str, Any]) -> None:
 class Recorder:
     """Runs the stages of an experiment and keeps its files up to date."""
 
-    def __init__(self, run: Run, directory: Path, progress: reporting.Progress) -> None:
+    def __init__(
+        self, run: Run, directory: Path, progress: reporting.Progress, loggers: Loggers
+    ) -> None:
         self.run, self.directory, self.progress = run, directory, progress
+        self.loggers = loggers
         self.metrics = directory / "metrics.csv"
         self.evaluations = directory / "evaluations.csv"
         self.arms: dict[str, dict[str, Any]] = {}
@@ -272,17 +280,20 @@ class Recorder:
         metrics_file.truncate_after(self.metrics, arm, done)
         _truncate_evaluations(self.evaluations, arm, done)
         self._cost[arm] = _cost_so_far(self.metrics, stage)
+        self.loggers.resume(arm, int(np.max(self._cost[arm][0])))
         self.progress.begin(arm, done)
         config = self.run.config
-        result = run_stage(
-            stage,
-            start,
-            mesh=self.run.mesh,
-            meta={"experiment": config.experiment, "preset": config.preset},
-            on_chunk=lambda chunk: self._record(stage, chunk),
-            on_resume=lambda epoch: self.progress.say(f"{arm}: going on from epoch {epoch}."),
-            on_stop=lambda stop: self.progress.say(f"{arm}: {stop}."),
-        )
+        with stop_when_asked(self.progress.say) as asked:
+            result = run_stage(
+                stage,
+                start,
+                mesh=self.run.mesh,
+                meta={"experiment": config.experiment, "preset": config.preset},
+                on_chunk=lambda chunk: self._record(stage, chunk),
+                on_resume=lambda epoch: self.progress.say(f"{arm}: going on from epoch {epoch}."),
+                on_stop=lambda stop: self.progress.say(f"{arm}: {stop}."),
+                stop_asked=asked,
+            )
         self.params[arm] = result.states.params
         if result.stops:
             self.stops[arm] = [asdict(stop) for stop in result.stops]
@@ -340,9 +351,9 @@ class Recorder:
         clock = seconds + chunk.seconds * np.arange(1, count + 1) / count
         values = {name: getattr(chunk.metrics, name) for name in _FIGURES}
         values |= {"return": chunk.metrics.episode_return, "env_steps": env_steps, "seconds": clock}
-        metrics_file.append_rows(
-            self.metrics, metrics_file.rows_of(arm, stage.seeds, chunk.first_epoch + 1, values)
-        )
+        rows = metrics_file.rows_of(arm, stage.seeds, chunk.first_epoch + 1, values)
+        metrics_file.append_rows(self.metrics, rows)
+        self.loggers.log(rows)
         self._cost[arm] = (env_steps[:, -1], seconds + chunk.seconds)
         every = self.run.config.evaluate_every
         if arm != SOURCE and every and chunk.epoch // every > chunk.first_epoch // every:
@@ -493,8 +504,12 @@ def run_experiment(config: TransferConfig) -> dict[str, Any]:
         arms += [TRANSFER, SCRATCH] if config.scratch else [TRANSFER]
     epochs = {arm: run.stage(arm).epochs for arm in arms}
     run.mesh  # noqa: B018 - refused, if it is, before anything is written
-    with claimed(config) as directory, reporting.Progress(epochs) as progress:
-        recorder = Recorder(run, directory, progress)
+    with (
+        claimed(config) as directory,
+        reporting.Progress(epochs) as progress,
+        Loggers(config.log, directory, _plain(asdict(config))) as loggers,
+    ):
+        recorder = Recorder(run, directory, progress, loggers)
         source = config.source_checkpoint or run.checkpoints(SOURCE)
         if SOURCE in arms:
             recorder.train(SOURCE, lambda: fresh_states(run.stage(SOURCE)))

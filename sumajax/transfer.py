@@ -140,6 +140,7 @@ def run_stage(
     meta: dict[str, Any] | None = None,
     on_chunk: Callable[[Chunk], None] = lambda chunk: None,
     on_resume: Callable[[int], None] = lambda epoch: None,
+    stop_asked: Callable[[], bool] = lambda: False,
     on_stop: Callable[[Stop], None] = lambda stop: None,
     chunk: int = CHUNK,
 ) -> StageResult:
@@ -151,6 +152,7 @@ def run_stage(
       on_chunk: called after every chunk, before its checkpoint is written: what it writes may be
         ahead of the checkpoints when a run is killed, and cut back, but is never behind.
       on_resume: called first with the epoch that training goes on from.
+      stop_asked: called after every checkpoint; True stops there, with a KeyboardInterrupt.
       on_stop: called once for each seed that stops; the others go on.
 
     Raises:
@@ -192,6 +194,8 @@ def run_stage(
             stops += (stop,)
         told = {**description, "epoch": done, "stops": [asdict(stop) for stop in stops]}
         checkpoint.save(stage.directory, states, told)
+        if stop_asked():
+            raise KeyboardInterrupt
     if len(stops) == num_seeds:
         raise StoppedError(
             f"no seed of the {stage.arm} stage is left ({stops[0]}); try a lower learning rate or "

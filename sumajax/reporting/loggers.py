@@ -4,8 +4,10 @@ Neither library is imported, or needed, before a logger is asked for. metrics.cs
 and stays the run's own record; a logger only shows it elsewhere.
 """
 
+import importlib.util
 import math
 import os
+import sys
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -41,11 +43,9 @@ class Loggers:
     def __init__(
         self, names: Sequence[str], directory: str | Path, config: Mapping[str, Any] | None = None
     ) -> None:
-        for name in names:
-            if name not in _LOGGERS:
-                raise ValueError(f"logger {name!r} is unknown; choose of {', '.join(_LOGGERS)}.")
+        check_installed(names)
         self._loggers: list[Logger] = [
-            _made(name, Path(directory), config or {}) for name in dict.fromkeys(names)
+            _LOGGERS[name][0](Path(directory), config or {}) for name in dict.fromkeys(names)
         ]
 
     def resume(self, arm: str, env_steps: int) -> None:
@@ -154,15 +154,21 @@ _LOGGERS: dict[str, tuple[type[Any], str]] = {
 """By name: the logger, and the library it needs."""
 
 
-def _made(name: str, directory: Path, config: Mapping[str, Any]) -> Logger:
-    logger, library = _LOGGERS[name]
-    try:
-        return logger(directory, config)
-    except ImportError:
-        raise ValueError(
-            f"logger {name!r} needs {library}, which is not installed; "
-            "pip install -e '.[logging]' brings it."
-        ) from None
+def check_installed(names: Sequence[str]) -> None:
+    """Refuses loggers that are unknown or whose library is missing, before anything is written.
+
+    Raises:
+      ValueError: says which and how to get it.
+    """
+    for name in names:
+        if name not in _LOGGERS:
+            raise ValueError(f"logger {name!r} is unknown; choose of {', '.join(_LOGGERS)}.")
+        library = _LOGGERS[name][1]
+        if library not in sys.modules and importlib.util.find_spec(library) is None:
+            raise ValueError(
+                f"logger {name!r} needs {library}, which is not installed; "
+                "pip install -e '.[logging]' brings it."
+            )
 
 
 def _numbers(row: Mapping[str, Any]) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """TensorBoard and W&B: what is sent, what a missing library says; imported only when asked for."""
 
-import builtins
+import importlib.util
 import math
 import subprocess
 import sys
@@ -134,16 +134,11 @@ def test_none_at_all(tmp_path):
 
 @pytest.mark.parametrize(("name", "library"), [("tensorboard", "tensorboardX"), ("wandb", "wandb")])
 def test_a_missing_library_is_named(name, library, tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def without(module, *rest):
-        if module == library:
-            raise ImportError(module)
-        return real(module, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.delitem(sys.modules, library, raising=False)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=rf"needs {library}, which is not .*\[logging\]"):
         Loggers([name], tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_unknown_logger(tmp_path):
