@@ -30,7 +30,8 @@ class LearnerConfig:
       team_reward: share of the team's mean in each agent's return, 0 to 1.
       advantages: `raw`, `centred` to mean 0 over the batch, or `normalised` to standard deviation 1
         as well.
-      mask_inactive: no policy gradient for agents whose actions no longer change anything.
+      mask_inactive: no policy gradient for actions that no longer change anything; what an agent
+        that has arrived says is still trained.
       loss: `actor_critic`, or `hetnet`, the per-class loss of HetNet's published program, which
         is of whole episodes only and normalises advantages in its own way.
       value_weight, policy_weight, entropy_weight: of the critic's squared error, of the policy
@@ -54,8 +55,8 @@ class LearnerConfig:
     gamma: float = 0.95
     gae_lambda: float = 0.95
     bootstrap_timeouts: bool = True
-    team_reward: float = 0.0
-    advantages: Advantages = "raw"
+    team_reward: float = 0.2
+    advantages: Advantages = "centred"
     mask_inactive: bool = True
     loss: Loss = "actor_critic"
     value_weight: float = 0.5
@@ -63,7 +64,7 @@ class LearnerConfig:
     entropy_weight: float = 0.004
     optimiser: Optimiser = "adam"
     learning_rate: float = 1.5e-3
-    max_grad_norm: float | None = 2.0
+    max_grad_norm: float | None = 0.5
     clip_per_env: bool = False
     warmup_epochs: int = 0
     anneal_epochs: int = 0
@@ -86,6 +87,7 @@ _PUBLISHED: dict[str, Any] = {
     "gamma": 1.0,
     "gae_lambda": 1.0,
     "bootstrap_timeouts": False,
+    "team_reward": 0.0,
     "advantages": "raw",
     "mask_inactive": False,
     "value_weight": 0.01,
@@ -112,7 +114,7 @@ _HETNET: dict[str, Any] = {
 _TEAM = {"team_reward": 1.0}
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    "fast": {"commnet": _TEAM, "ic": _TEAM},
+    "fast": {"commnet": _TEAM, "ic": _TEAM, "iric": {"team_reward": 0.0}},
     "paper": {
         "ic3net": _PUBLISHED,
         "commnet": {**_PUBLISHED, **_TEAM},

@@ -70,8 +70,8 @@ def test_an_epoch_of_the_paper_is_ten_updates():
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_preset_fast_differs_only_in_the_reward(policy):
-    """CommNet and IC are trained on the team's mean (algorithms.md 1.2), in every preset."""
-    team = 1.0 if policy in ("commnet", "ic") else 0.0
+    """CommNet and IC are trained on the team's mean, IRIC on its own (algorithms.md 1.2)."""
+    team = {"commnet": 1.0, "ic": 1.0, "iric": 0.0}.get(policy, LearnerConfig().team_reward)
     assert preset("fast", policy) == LearnerConfig(team_reward=team)
 
 
