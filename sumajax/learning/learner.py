@@ -128,13 +128,19 @@ class Learner:
         direction, opt_state = optimiser.update(grads, state.opt_state, state.params)
         rate = learning_rate(self.config, state.updates)
         params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
-        next_state = replace(
-            state, params=params, opt_state=opt_state, actors=actors, updates=state.updates + 1
-        )
         loss = tally.loss.policy + tally.loss.value + tally.loss.entropy
         faults = guard.faults_of(loss, tally.gradient_norm, params)
         nothing = jax.tree.map(jnp.zeros_like, tally)
-        next_state, tally = guard.unless(faults, (next_state, tally), (state, nothing))
+        new = params, opt_state, actors, tally
+        old = state.params, state.opt_state, state.actors, nothing
+        params, opt_state, actors, tally = guard.unless(faults, new, old)
+        next_state = replace(
+            state,
+            params=params,
+            opt_state=opt_state,
+            actors=actors,
+            updates=state.updates + tally.updates,
+        )
         return next_state, replace(tally, faults=faults)
 
     def _inputs(self, state: TrainState) -> tuple[Actors, Draws]:

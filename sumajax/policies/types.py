@@ -141,7 +141,8 @@ class Policy:
             state=jnp.zeros((team.num_agents, *team.state_shape)),
             view=jnp.zeros((team.num_agents, *team.view_shape)),
         )
-        noise = jax.tree.map(jnp.zeros_like, self.sample_noise(key, ()))
+        draws = jax.eval_shape(lambda: self.sample_noise(key, ()))  # the key is for `init` alone
+        noise = jax.tree.map(lambda draw: jnp.zeros(draw.shape, draw.dtype), draws)
         return self.module.init(
             key, self.initial_carry(), obs, noise, method=self.module.encode_and_step
         )

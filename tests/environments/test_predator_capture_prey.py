@@ -1,6 +1,7 @@
 """Predator-Capture-Prey as its rules say: what capture agents add to Predator-Prey."""
 
 import re
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -179,6 +180,48 @@ class TestReward:
         done = np.asarray(states.reached) & np.asarray(states.captured)
         returns = np.asarray(transition.reward).sum(0)
         np.testing.assert_allclose(returns, -0.05 * (~done).sum(0), atol=1e-5)
+
+
+def by_definition(env, before, actions, after):
+    """Rewards (N,), terminated, truncated and success of a step, agent by agent."""
+    before, after, rewards = take_all(before), take_all(after), []
+    there = [(agent == after.prey).all() for agent in after.agents]
+    done = []
+    for i, agent_class in enumerate(env.agent_class):
+        stood_there = (before.agents[i] == before.prey).all()
+        captures = agent_class == 0 or before.captured[i] or (stood_there and actions[i] == CAPTURE)
+        done.append(there[i] and captures)
+        team = {"mixed": 0, "cooperative": 0.05 * sum(there)}
+        team["competitive"] = 0.05 / max(sum(there), 1)
+        waits = -0.025 if env.capture_reward == "second" and there[i] else -0.05
+        rewards.append(team[env.reward_mode] if done[i] else waits)
+    terminated = env.reward_mode == "mixed" and all(done)
+    truncated = before.time + 1 == env.max_steps and not terminated
+    return rewards, terminated, truncated, all(done)
+
+
+def take_all(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+class TestDefinition:
+    @settings(deadline=None, max_examples=40)
+    @given(
+        seed=seeds,
+        mode=st.sampled_from(["mixed", "cooperative", "competitive"]),
+        scheme=st.sampled_from(["default", "second"]),
+    )
+    def test_rewards_and_ends(self, seed, mode, scheme):
+        """Of a step in the middle of an episode, on a grid so small that most have arrived."""
+        env = PredatorCapturePrey((2, 2), 2, 1, reward_mode=mode, capture_reward=scheme)
+        env = replace(env, max_steps=13)
+        state, actions = random_moment(env, seed)
+        after, transition = step(env, state, actions)
+        rewards, terminated, truncated, success = by_definition(env, state, actions, after)
+        np.testing.assert_allclose(transition.reward, rewards, atol=1e-6)
+        assert transition.terminated == terminated
+        assert transition.truncated == truncated
+        assert transition.success == success
 
 
 class TestObservation:

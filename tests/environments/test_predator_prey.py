@@ -26,6 +26,7 @@ from episodes import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import chisquare
 
 from sumajax.environments import Environment, PredatorPrey, predator_prey
 from sumajax.environments.grid import CAPTURE, DOWN, LEFT, RIGHT, STAY, UP
@@ -48,6 +49,15 @@ class TestReset:
         states = reset_many(env, jax.random.key(0), 200)
         cells = np.concatenate([states.agents, states.prey[:, None]], axis=1)
         assert all(len(np.unique(c, axis=0)) == 6 for c in cells)
+
+    def test_everybody_starts_anywhere_with_equal_chances(self):
+        """The agents and the prey, over a million episodes."""
+        env = PredatorPrey(size=(3, 4), num_predators=2)
+        states = reset_many(env, jax.random.key(0), 1_000_000)
+        for cells in (*np.moveaxis(np.asarray(states.agents), 1, 0), np.asarray(states.prey)):
+            counts = np.bincount(cells @ [4, 1], minlength=12)
+            assert counts.shape == (12,)
+            assert chisquare(counts).pvalue > 1e-3
 
     def test_an_episode_starts_from_nothing(self):
         state = duo().reset(jax.random.key(0))
@@ -278,6 +288,16 @@ class TestFunctions:
         for e in range(8):
             assert_same(step(self.ENV, take(states, e), actions[e]), take(together, e))
             np.testing.assert_array_equal(view(self.ENV, take(states, e)), views[e])
+
+    def test_wide_numbers_change_nothing(self):
+        """With 64-bit types on, not even the types of the results."""
+        state, actions = self.recorded()
+        narrow = reset(self.ENV, jax.random.key(7)), play_recorded(self.ENV, state, actions)
+        with jax.enable_x64(True):
+            wide = self.ENV.reset(jax.random.key(7)), play_recorded(self.ENV, state, actions)
+            wide_view = self.ENV.view(wide[0])
+        assert_same(wide, narrow)
+        np.testing.assert_array_equal(wide_view, self.ENV.view(narrow[0]), strict=True)
 
     def test_methods_are_the_importable_functions(self):
         key = jax.random.key(5)
