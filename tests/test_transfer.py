@@ -172,3 +172,19 @@ def test_a_seed_that_stops_is_told_of_once_and_the_others_go_on(tmp_path, monkey
             run(9)
     assert len(said) == 2
     assert checkpoint.read_meta(tmp_path)["epoch"] == 6, "nothing is trained in vain"
+
+
+def test_a_stop_that_is_asked_for_comes_after_a_checkpoint(tmp_path, monkeypatch):
+    trained = stage(TARGET, tmp_path, epochs=6)
+    monkeypatch.setattr(parallel, "compile_train", train_until([99, 99], trained.learner))
+    answers, told = iter([False, True]), []
+    with pytest.raises(KeyboardInterrupt):
+        run_stage(
+            trained,
+            lambda: fresh_states(trained),
+            on_chunk=lambda chunk: told.append(chunk.epoch),
+            chunk=2,
+            stop_asked=lambda: next(answers),
+        )
+    assert told == [2, 4]
+    assert checkpoint.read_meta(tmp_path)["epoch"] == 4
