@@ -174,7 +174,7 @@ def test_killed_at_random_moments(seed, tmp_path, cache):
 
 
 def test_killed_while_a_second_run_is_refused(tmp_path, cache):
-    """Real processes: the first is held in a save, refuses the second, dies, and is gone on with."""
+    """Real processes: the first is held in its middle, the second refused, the first killed."""
     with server(SOURCE_ALONE, cache) as runs:
         events = runs.finish(tmp_path / "whole")
         first = runs.run(tmp_path / "run", event=events // 2, signal=SIGSTOP)
