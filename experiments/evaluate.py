@@ -276,11 +276,11 @@ def table(report: dict[str, Any]) -> list[dict[str, Any]]:
     for entry in report["tasks"]:
         modes = next(iter(entry["policies"].values()))
         for mode in modes:
-            row: dict[str, Any] = {"task": entry["label"], "actions": mode}
+            row: dict[str, Any] = {"grid, team": entry["label"], "actions": mode}
             for name, of_mode in entry["policies"].items():
                 steps, success = (np.mean(of_mode[mode][k]) for k in ("steps_taken", "success"))
                 row[name] = f"{steps:.2f} {success:6.1%}"
-            rows.append(row | {"shortest": f"{entry['shortest_path_steps']:.2f}"})
+            rows.append(row | {"bound": f"{entry['shortest_path_steps']:.2f}"})
     return rows
 
 
@@ -289,7 +289,7 @@ def label(task: PredatorCapturePrey) -> str:
     team = str(task.num_predators)
     if not isinstance(task, PredatorPrey):
         team += f"+{task.num_capturers}"
-    return f"{_grid(task.shape)}, {team} agents"
+    return f"{_grid(task.shape)}, {team}"
 
 
 def _grid(shape: tuple[int, int]) -> str:

@@ -52,10 +52,10 @@ def evaluated(path, **options):
 
 def test_every_policy_on_the_tasks_of_the_run(run, tmp_path, capsys):
     report = evaluated(run, json=tmp_path / "all.json")
-    assert [entry["label"] for entry in report["tasks"]] == ["3x3, 2 agents", "6x6, 2 agents"]
+    assert [entry["label"] for entry in report["tasks"]] == ["3x3, 2", "6x6, 2"]
     assert list(report["policies"]) == ["transfer", "source"]
     assert report["policies"]["source"] == {
-        "trained_on": "3x3, 2 agents",
+        "trained_on": "3x3, 2",
         "policy": "ic3net",
         "epoch": 3,
         "seeds": [0, 4],
@@ -68,7 +68,8 @@ def test_every_policy_on_the_tasks_of_the_run(run, tmp_path, capsys):
                 assert min(figures["steps_taken"]) >= entry["shortest_path_steps"]
     assert json.loads((tmp_path / "all.json").read_text()) == report
     said = capsys.readouterr().out
-    for text in ("transfer", "source", "3x3, 2 agents", "greedy", "sampled", "shortest"):
+    assert "…" not in said, "nothing is cut off at 80 columns"
+    for text in ("transfer", "source", "3x3, 2", "greedy", "sampled", "bound"):
         assert text in said
 
 
@@ -89,7 +90,7 @@ def test_every_grid_with_every_team(run):
     options = program.EvaluateConfig(run, sizes=("3", "6", "2x3"), teams=("1", "3"), max_steps=5)
     tasks = program.tasks_of(options, program.load(options))
     assert [program.label(task) for task in tasks] == [
-        f"{grid}, {team} agents" for grid in ("3x3", "6x6", "2x3") for team in (1, 3)
+        f"{grid}, {team}" for grid in ("3x3", "6x6", "2x3") for team in (1, 3)
     ]
     assert {task.max_steps for task in tasks} == {5}
 
@@ -103,14 +104,14 @@ def test_one_checkpoint_alone(run, capsys):
     for path in (run / "checkpoints" / "transfer", *(run / "checkpoints" / "transfer").iterdir()):
         report = evaluated(path, seeds=(0,), modes=("sampled",))
         assert list(report["policies"]) == ["transfer"]
-        assert [entry["label"] for entry in report["tasks"]] == ["6x6, 2 agents"]
+        assert [entry["label"] for entry in report["tasks"]] == ["6x6, 2"]
         assert capsys.readouterr().out
 
 
 def test_capture_agents(pcp, capsys):
     report = evaluated(pcp, teams=("2+1",), modes=("sampled",))
-    assert report["tasks"][0]["label"] == "3x3, 2+1 agents"
-    assert "3x3, 2+1 agents" in capsys.readouterr().out
+    assert report["tasks"][0]["label"] == "3x3, 2+1"
+    assert "3x3, 2+1" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("name", "kind"), [("a.gif", "GIF"), ("a.png", "PNG")])
@@ -133,8 +134,8 @@ BAD = {
     "no size": (["{run}", "--sizes", "big"], "size 'big' is no side of a grid"),
     "no team": (["{run}", "--teams", "-1"], "team '-1' is no number of predators"),
     "too many": (["{run}", "--sizes", "3", "--teams", "30"], "30 agents and a prey need 31"),
-    "capture agents": (["{run}", "--teams", "3+2"], "Predator-Prey has none; give the number"),
-    "which agents": (["{pcp}", "--teams", "3"], "does not say how many capture agents; give both"),
+    "capture": (["{run}", "--teams", "3+2"], "Predator-Prey has none; give the number"),
+    "which": (["{pcp}", "--teams", "3"], "does not say how many capture agents; give both"),
     "episodes": (["{run}", "--episodes", "0"], "episodes must be 1 to 65536, got 0"),
     "step limit": (["{run}", "--max-steps", "0"], "max_steps must be at least 1, got 0"),
     "existing": (["{run}", "--json", "{tmp}/mine.json"], "mine.json exists; choose another --json"),
