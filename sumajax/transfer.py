@@ -160,6 +160,7 @@ def run_stage(
     """
     num_seeds, num_envs = len(stage.seeds), stage.learner.config.num_envs
     mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
+    is_new = checkpoint.latest(stage.directory) is None
     first_epoch, states, stops = _resumed(stage, start)
     if first_epoch:
         on_resume(first_epoch)
@@ -171,7 +172,7 @@ def run_stage(
         seeds=list(stage.seeds),
         **(meta or {}),
     )
-    if not first_epoch:
+    if is_new:
         checkpoint.save(stage.directory, states, {**description, "epoch": 0})
     compile_seconds = train_seconds = 0.0
     train: parallel.Train | None = None

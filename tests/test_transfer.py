@@ -174,6 +174,20 @@ def test_a_seed_that_stops_is_told_of_once_and_the_others_go_on(tmp_path, monkey
     assert checkpoint.read_meta(tmp_path)["epoch"] == 6, "nothing is trained in vain"
 
 
+def test_a_stage_killed_before_its_first_epoch_starts_from_what_it_saved(tmp_path, monkeypatch):
+    """And saves no second checkpoint of epoch 0, which an uninterrupted run does not have."""
+    chosen = stage(TARGET, tmp_path, epochs=2)
+    monkeypatch.setattr(parallel, "compile_train", train_until([99, 99], chosen.learner))
+    checkpoint.save(
+        tmp_path,
+        fresh_states(chosen),
+        checkpoint.describe(chosen.learner.env, chosen.learner.policy, epoch=0),
+    )
+    run_stage(chosen, lambda: pytest.fail("started anew"), chunk=1)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["000001-step-0", "000002-step-1", "000003-step-2"]
+
+
 def test_a_stop_that_is_asked_for_comes_after_a_checkpoint(tmp_path, monkeypatch):
     trained = stage(TARGET, tmp_path, epochs=6)
     monkeypatch.setattr(parallel, "compile_train", train_until([99, 99], trained.learner))
