@@ -17,6 +17,7 @@ import tyro
 from config_file import NOTE, with_config_file
 from transfer_run import TransferConfig, run_experiment
 
+from sumajax import hosts
 from sumajax.learning import parallel, preset
 
 CACHE = Path.home() / ".cache" / "sumajax" / "compiled"
@@ -38,6 +39,8 @@ def main(experiment: type[TransferConfig]) -> None:
         default = experiment(learner=preset(chosen.preset, chosen.policy))  # type: ignore[call-arg]
         config = parse(experiment, default, arguments, NOTE)
         prepare_jax(config.num_devices)
+        if config.coordinator is not None:
+            hosts.connect(config.hosts, config.host, config.coordinator)
         if run_experiment(config).get("stops"):
             raise SystemExit(STOPPED)
 

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -24,7 +24,7 @@ from filelock import FileLock, Timeout
 from interrupt import stop_when_asked
 from jax.sharding import Mesh
 
-from sumajax import checkpoint, reporting
+from sumajax import checkpoint, hosts, reporting
 from sumajax.environments import PredatorCapturePrey
 from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES, evaluate, evaluate_random, shortest_path_steps
@@ -47,6 +47,9 @@ SOURCE, TRANSFER, SCRATCH = "source", "transfer", "scratch"
 MAX_EPOCHS = 100_000
 """Updates are counted in 32 bits, and an epoch has at most 20,000."""
 MAX_DEVICES = 256
+MAX_HOSTS = 256
+WHERE = ("devices", "hosts", "host", "coordinator")
+"""Options that say where a run is computed: they change no result, and may change between runs."""
 EVALUATION_SEED = 7
 """Of the policy's own randomness in held-out episodes; the starts are fixed in the package."""
 
@@ -86,7 +89,15 @@ class TransferConfig:
     threshold: float = 20.0
     """Steps taken that count as solved in the comparison."""
     devices: int | None = None
-    """CPU devices to spread seeds and environments over; None: all that they spread over."""
+    """CPU devices to spread seeds and environments over, of each host; None: all that they spread
+    over."""
+    hosts: int = 1
+    """How many machines (or processes) train together, each started with the same command and its
+    own --host."""
+    host: int = 0
+    """Which of them this one is; 0 has the files and the screen."""
+    coordinator: str | None = None
+    """HOST:PORT of host 0, with several hosts."""
     log: tuple[LoggerName, ...] = ()
     """Where to show the metrics beside metrics.csv: tensorboard, wandb."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
@@ -97,6 +108,8 @@ class TransferConfig:
             ("source_epochs", 1, MAX_EPOCHS),
             ("target_epochs", 0, MAX_EPOCHS),
             ("evaluate_every", 0, MAX_EPOCHS),
+            ("hosts", 1, MAX_HOSTS),
+            ("host", 0, self.hosts - 1),
             ("num_devices", 1, MAX_DEVICES),
         ):
             if not least <= getattr(self, name) <= most:
@@ -116,16 +129,22 @@ class TransferConfig:
                 "source-checkpoint leaves the source stage out and target-epochs 0 the target; "
                 "give target-epochs of at least 1."
             )
-        parallel.spread(len(self.seeds), self.learner.num_envs, self.num_devices)
+        if (self.coordinator is None) != (self.hosts == 1):
+            raise ValueError(
+                f"hosts {self.hosts} and coordinator {self.coordinator} do not go together; "
+                "several hosts need the HOST:PORT of host 0, one needs none."
+            )
+        if self.coordinator is not None:
+            hosts.address(self.coordinator)
+        parallel.spread(len(self.seeds), self.learner.num_envs, self.hosts * self.num_devices)
 
     @property
     def num_devices(self) -> int:
-        """Those asked for, or as many of the machine's as seeds and environments spread over."""
+        """Of this host: those asked for, or as many as seeds and environments spread over."""
         if self.devices is not None:
             return self.devices
-        return parallel.most_devices(
-            len(self.seeds), self.learner.num_envs, min(os.cpu_count() or 1, MAX_DEVICES)
-        )
+        most = min(os.cpu_count() or 1, MAX_DEVICES)
+        return parallel.most_devices(len(self.seeds), self.learner.num_envs, most, self.hosts)
 
     @property
     def directory(self) -> Path:
@@ -155,18 +174,17 @@ class Run:
             "the source stage",
         )
         if config.source_checkpoint is not None:
-            saved_parts(
-                run.stage(TRANSFER),
-                config.source_checkpoint,
-                carry_optimiser=config.carry_optimiser,
-            )
+            hosts.first_does(partial(run._check_source, config.source_checkpoint))
         return run
+
+    def _check_source(self, checkpoints: Path) -> None:
+        saved_parts(self.stage(TRANSFER), checkpoints, carry_optimiser=self.config.carry_optimiser)
 
     @cached_property
     def mesh(self) -> Mesh:
-        return parallel.make_mesh(
-            len(self.config.seeds), self.config.learner.num_envs, self.config.num_devices
-        )
+        config = self.config
+        devices = config.hosts * config.num_devices
+        return parallel.make_mesh(len(config.seeds), config.learner.num_envs, devices)
 
     def checkpoints(self, arm: str) -> Path:
         return self.config.directory / "checkpoints" / arm
@@ -194,7 +212,7 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
       OSError: when it cannot be written.
     """
     directory = config.directory
-    described = _plain({**asdict(config), "devices": config.num_devices})
+    described = _described(config)
     missing: list[Path] = []
     try:
         _check_directory(directory, described)  # before anything is written there
@@ -227,6 +245,12 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
         lock.release()
 
 
+def _described(config: TransferConfig) -> dict[str, Any]:
+    """The options as config.json keeps them, without those of one host's place in the run."""
+    options = {**asdict(config), "devices": config.num_devices}
+    return _plain({name: options[name] for name in options if name not in WHERE[1:]})
+
+
 _LEFTOVER = re.compile(r"\..+\.\d+\.tmp")
 """What a writer that was killed leaves of a file."""
 
@@ -246,7 +270,11 @@ def _check_directory(directory: Path, described: dict[str, Any]) -> None:
         before = dict(json.loads(file.read_text())["options"])
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{file} is not readable; choose another --output.") from None
-    changed = [name for name in described if described[name] != before.get(name, described[name])]
+    changed = [
+        name
+        for name in described
+        if name not in WHERE and described[name] != before.get(name, described[name])
+    ]
     if changed:
         name = changed[0]
         raise ValueError(
@@ -498,10 +526,52 @@ def run_experiment(config: TransferConfig) -> dict[str, Any]:
     Raises:
       ValueError, OSError: one sentence each, before any long work.
     """
-    run = Run.of(config)
+    with hosts.leading():
+        if hosts.several():
+            _check_hosts(config)
+        run = Run.of(config)
+        arms = _arms(config)
+        summary = _lead(run, arms) if hosts.is_first() else _follow(run, arms)
+        stops = hosts.first_does(lambda: summary.get("stops", {}))
+    return {**summary, "stops": stops} if stops else summary
+
+
+def _check_hosts(config: TransferConfig) -> None:
+    """Refuses hosts that were started differently: each would wait for what the others never do."""
+    options = hosts.everyone_says(
+        {**_described(config), "devices of each host": jax.local_device_count()}
+    )
+    for host, other in enumerate(options):
+        for name, value in options[0].items():
+            if other[name] != value:
+                raise ValueError(
+                    f"host {host} has {name} {other[name]}, host 0 has {value}; start every host "
+                    "with the same options but --host."
+                )
+
+
+def _arms(config: TransferConfig) -> list[str]:
+    """The stages there are to train, in order."""
     arms = [SOURCE] if config.source_checkpoint is None else []
     if config.target_epochs:
         arms += [TRANSFER, SCRATCH] if config.scratch else [TRANSFER]
+    return arms
+
+
+def _follow(run: Run, arms: list[str]) -> dict[str, Any]:
+    """A host's share of the training, while host 0 has the files and the screen."""
+    with stop_when_asked(lambda _: print(NOT_HERE, file=sys.stderr, flush=True)):
+        for stage in map(run.stage, arms):
+            run_stage(stage, partial(fresh_states, stage), mesh=run.mesh)
+    return {}
+
+
+NOT_HERE = "Ctrl-C on host 0 stops all hosts, with a checkpoint; again here: this one, at once."
+
+
+def _lead(run: Run, arms: list[str]) -> dict[str, Any]:
+    """The whole experiment with its files; returns its summary."""
+    config = run.config
     epochs = {arm: run.stage(arm).epochs for arm in arms}
     run.mesh  # noqa: B018 - refused, if it is, before anything is written
     with (

@@ -31,6 +31,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sumajax import hosts
 from sumajax.description import CheckpointError, check_compatible, describe, reason, rebuild
 
 __all__ = [
@@ -626,16 +627,45 @@ def _orbax() -> Iterator[Any]:
     level = log.level
     log.setLevel(logging.CRITICAL)
     try:
-        yield ocp
+        with _alone(ocp):
+            yield ocp
     finally:
         log.setLevel(level)
+
+
+def _alone(ocp: Any) -> Any:
+    """Orbax not awaiting the other processes of a run: one of them reads and writes."""
+    context = ocp.Context()
+    if hosts.several():
+        context.multiprocessing.primary_host = jax.process_index()
+        context.multiprocessing.active_processes = {jax.process_index()}
+    return context
 
 
 def _orbax_save(path: Path, arrays: dict[str, np.ndarray]) -> None:
     # Orbax refuses arrays without elements; their shape and dtype in the description say it all.
     stored = _nested({name: array for name, array in arrays.items() if array.size})
     with _orbax() as ocp:
-        ocp.save(path, stored)
+        if hosts.several():
+            _orbax_save_alone(path, stored)
+        else:
+            ocp.save(path, stored)
+
+
+def _orbax_save_alone(path: Path, stored: dict[str, Any]) -> None:
+    """By Orbax's older interface: the newer one has all processes agree on the path even so."""
+    import orbax.checkpoint as ocp
+
+    me = jax.process_index()
+    only = ocp.options.MultiprocessingOptions(
+        primary_host=me, active_processes={me}, barrier_sync_key_prefix="sumajax"
+    )
+    handler = ocp.CompositeCheckpointHandler(
+        composite_options=ocp.CompositeOptions(multiprocessing_options=only),
+        pytree=ocp.PyTreeCheckpointHandler(multiprocessing_options=only),
+    )
+    with ocp.Checkpointer(handler, multiprocessing_options=only) as checkpointer:
+        checkpointer.save(path.absolute(), ocp.args.Composite(pytree=ocp.args.PyTreeSave(stored)))
 
 
 def _orbax_load(
@@ -650,7 +680,7 @@ def _orbax_load(
             there = on_disk.get(name)
             if there is None or (tuple(there.shape), there.dtype) != (shape, dtype):
                 raise _DamagedError(f"{path} is damaged (leaf {name} is not as described)")
-        context = ocp.Context()
+        context = _alone(ocp)
         context.pytree.loading.partial_load = True
         with context:
             wanted = _nested({name: on_disk[name] for name in stored})

@@ -2,11 +2,13 @@
 
 A stage trains one policy on one task for some epochs, several seeds side by side, and leaves
 checkpoints from which it goes on when it is started again, and from which a target stage starts.
+Of several hosts (`sumajax.hosts`) the first alone has files; all train.
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from sumajax import checkpoint
+from sumajax import checkpoint, hosts
 from sumajax.checkpoint import CheckpointError
 from sumajax.learning import parallel
 from sumajax.learning.guard import FAULTS
@@ -155,16 +157,22 @@ def run_stage(
       stop_asked: called after every checkpoint; True stops there, with a KeyboardInterrupt.
       on_stop: called once for each seed that stops; the others go on.
 
+    Every host calls this with the same stage; only the first one's `start` and `stop_asked` are
+    called, and only it touches the directory.
+
     Raises:
       StoppedError: when the last seed has stopped; its checkpoint is written.
+      HostError: on the other hosts, what went wrong on the first.
     """
     num_seeds, num_envs = len(stage.seeds), stage.learner.config.num_envs
     mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
-    is_new = checkpoint.latest(stage.directory) is None
-    first_epoch, states, stops = _resumed(stage, start)
+    (is_new, first_epoch, stopped), whole = hosts.first_makes(
+        lambda: _resumed(stage, start), lambda: jax.eval_shape(lambda: fresh_states(stage))
+    )
+    stops = tuple(Stop(**stop) for stop in stopped)
     if first_epoch:
         on_resume(first_epoch)
-    states = parallel.place(states, mesh)
+    states = parallel.place(whole, mesh)
     description = checkpoint.describe(
         stage.learner.env,
         stage.learner.policy,
@@ -172,8 +180,9 @@ def run_stage(
         seeds=list(stage.seeds),
         **(meta or {}),
     )
+    whole = whole if hosts.several() else states
     if is_new:
-        checkpoint.save(stage.directory, states, {**description, "epoch": 0})
+        hosts.first_does(partial(_save, stage, whole, {**description, "epoch": 0}))
     compile_seconds = train_seconds = 0.0
     train: parallel.Train | None = None
     length = _chunk_length(stage.epochs, first_epoch, chunk)
@@ -184,25 +193,37 @@ def run_stage(
             began = time.perf_counter()
             train = parallel.compile_train(stage.learner, mesh, length, states)
             compile_seconds = time.perf_counter() - began
+        hosts.meet()
         began = time.perf_counter()
         states, metrics = jax.block_until_ready(train(states))
         seconds = time.perf_counter() - began
         train_seconds += seconds
         done = epoch + length
-        on_chunk(Chunk(epoch, done, states, jax.device_get(metrics), seconds))
-        for stop in _new_stops(stage, states, metrics, stops):
+        whole, metrics = hosts.gathered((states, metrics))
+        on_chunk(Chunk(epoch, done, whole, jax.device_get(metrics), seconds))
+        for stop in _new_stops(stage, whole, metrics, stops):
             on_stop(stop)
             stops += (stop,)
         told = {**description, "epoch": done, "stops": [asdict(stop) for stop in stops]}
-        checkpoint.save(stage.directory, states, told)
-        if stop_asked():
+        if hosts.first_does(partial(_save, stage, whole, told, stop_asked)):
             raise KeyboardInterrupt
     if len(stops) == num_seeds:
         raise StoppedError(
             f"no seed of the {stage.arm} stage is left ({stops[0]}); try a lower learning rate or "
             "max_grad_norm in another directory."
         )
-    return StageResult(states, first_epoch, compile_seconds, train_seconds, stops)
+    return StageResult(whole, first_epoch, compile_seconds, train_seconds, stops)
+
+
+def _save(
+    stage: Stage,
+    states: TrainState,
+    meta: dict[str, Any],
+    stop_asked: Callable[[], bool] = lambda: False,
+) -> bool:
+    """Writes a checkpoint; whether to stop after it."""
+    checkpoint.save(stage.directory, states, meta)
+    return stop_asked()
 
 
 def _new_stops(
@@ -231,13 +252,14 @@ def saved_epoch(stage: Stage) -> int:
 
 def _resumed(
     stage: Stage, start: Callable[[], TrainState]
-) -> tuple[int, TrainState, tuple[Stop, ...]]:
+) -> tuple[tuple[bool, int, list[dict[str, Any]]], TrainState]:
+    """Whether the stage is new, the epoch it goes on from, which seeds had stopped; its states."""
     if checkpoint.latest(stage.directory) is None:
-        return 0, start(), ()
+        return (True, 0, []), start()
     like = jax.eval_shape(lambda: fresh_states(stage))
     states, meta = checkpoint.load(stage.directory, like)
-    stops = tuple(Stop(**stop) for stop in meta.get("stops", []))
-    return meta["epoch"], jax.tree.map(jnp.asarray, states), stops
+    told = (False, meta["epoch"], meta.get("stops", []))
+    return told, jax.tree.map(jnp.asarray, states)
 
 
 def _chunk_length(epochs: int, done: int, longest: int) -> int:

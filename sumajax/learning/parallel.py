@@ -17,6 +17,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from sumajax import hosts
 from sumajax.learning.learner import Learner, Metrics, TrainState
 
 SEEDS, ENVS = "seeds", "envs"
@@ -57,10 +58,14 @@ def spread(num_seeds: int, num_envs: int, devices: int) -> tuple[int, int]:
     return over_seeds, over_envs
 
 
-def most_devices(num_seeds: int, num_envs: int, most: int) -> int:
-    """The largest number of devices up to `most` that seeds and environments spread over."""
+def most_devices(num_seeds: int, num_envs: int, most: int, num_hosts: int = 1) -> int:
+    """The largest number of devices up to `most` that seeds and environments spread over.
 
-    def fits(devices: int) -> bool:
+    With several hosts: the number of each of them.
+    """
+
+    def fits(of_each: int) -> bool:
+        devices = of_each * num_hosts
         return num_envs % (devices // math.gcd(num_seeds, devices)) == 0
 
     return next(filter(fits, range(most, 1, -1)), 1)
@@ -122,10 +127,10 @@ def state_specs() -> Any:
 
 
 def place(states: TrainState, mesh: Mesh) -> TrainState:
-    """`states` as arrays that lie on the mesh."""
+    """`states`, the same on every host, as arrays that lie on the mesh."""
     specs = state_specs()
 
     def placed(name: str) -> Any:
-        return jax.device_put(getattr(states, name), NamedSharding(mesh, getattr(specs, name)))
+        return hosts.placed(getattr(states, name), NamedSharding(mesh, getattr(specs, name)))
 
     return TrainState(**{name: placed(name) for name in TrainState.__dataclass_fields__})

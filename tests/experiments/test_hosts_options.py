@@ -1,0 +1,47 @@
+"""Options for several hosts: mistakes refused at once, and a run that goes on elsewhere."""
+
+import json
+import os
+
+import pytest
+from pp_transfer import PPTransfer
+from transfer_run import claimed
+
+HERE = "127.0.0.1:1234"
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"hosts": 2}, "hosts 2 and coordinator None do not go together; several hosts need"),
+        ({"coordinator": HERE}, "hosts 1 and coordinator 127.0.0.1:1234 do not go together"),
+        ({"hosts": 0}, "hosts must lie between 1 and 256, got 0"),
+        ({"hosts": 2, "host": 2, "coordinator": HERE}, "host must lie between 0 and 1, got 2"),
+        ({"host": 1}, "host must lie between 0 and 0, got 1"),
+        ({"hosts": 2, "coordinator": "here"}, "coordinator is the HOST:PORT of host 0, got 'here'"),
+        (
+            {"hosts": 2, "coordinator": HERE, "devices": 2},
+            "50 environments do not spread over 4 devices",
+        ),
+    ],
+)
+def test_mistakes(options, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        PPTransfer(**options)
+
+
+def test_devices_of_each_host(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    assert PPTransfer(hosts=2, coordinator=HERE).num_devices == 5  # ten in all, of 50 environments
+
+
+def test_a_run_goes_on_with_other_devices_and_hosts(tmp_path):
+    output = tmp_path / "run"
+    with claimed(PPTransfer(output=output, devices=1)):
+        pass
+    with claimed(PPTransfer(output=output, devices=5, hosts=2, coordinator=HERE)):
+        options = json.loads((output / "config.json").read_text())["options"]
+    assert options["devices"] == 5
+    assert not {"hosts", "host", "coordinator"} & options.keys()
+    with pytest.raises(ValueError, match=r"holds a run with threshold 20\.0, not 21\.0"):
+        claimed(PPTransfer(output=output, threshold=21.0)).__enter__()
