@@ -13,13 +13,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy as np
 from jax.sharding import Mesh
 
 from sumajax import checkpoint
 from sumajax.checkpoint import CheckpointError
 from sumajax.learning import parallel
 from sumajax.learning.guard import FAULTS
-from sumajax.learning.learner import Learner, Metrics, TrainState
+from sumajax.learning.learner import Learner, Metrics, TrainState, make_learner
 
 CHUNK = 5
 """Epochs of a compiled call: between two looks at the metrics, and between two checkpoints."""
@@ -130,6 +131,27 @@ def saved_parts(stage: Stage, source: Path, *, carry_optimiser: bool = False) ->
     return {
         field: checkpoint.load_params(source, getattr(like, field), field=field) for field in fields
     }
+
+
+def untrained_parameters(source: Path, params: Any) -> list[str]:
+    """Names of the parameters that training the source left as they were first drawn.
+
+    A team of two predators and one capture agent has nobody to train what passes between two
+    capture agents, and where there is one sender an attention weight is 1 whatever its parameters:
+    they enter the target stage as random as they began (algorithms.md 5.5).
+
+    Args:
+      params: what was transferred from `source`, leaves (seeds, ...).
+    """
+    meta = checkpoint.read_meta(source)
+    learner = make_learner(*checkpoint.rebuild(meta))
+    drawn = parallel.init_seeds(learner, list(meta.get("seeds", [0]))).params
+    pairs = zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(drawn), strict=True)
+    return [
+        "/".join(str(key.key) for key in path)
+        for (path, after), before in pairs
+        if np.array_equal(after, np.broadcast_to(before, after.shape))
+    ]
 
 
 def run_stage(
