@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpy as np
 from jax.sharding import Mesh
 
 from sumajax import checkpoint
