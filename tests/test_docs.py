@@ -13,7 +13,6 @@ def test_extending(capsys):
     for code in re.findall(r"```python\n(.*?)```", (DOCS / "extending.md").read_text(), re.DOTALL):
         exec(compile(code, "extending.md", "exec"), shared)
     assert shared["metrics"].env_steps.tolist() == [20_000, 20_000]
-    assert shared["result"].success.mean() > 0.5  # random: 0.1
     assert capsys.readouterr().out.count("steps taken") == 2
 
 
