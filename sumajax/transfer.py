@@ -5,7 +5,7 @@ checkpoints from which it goes on when it is started again, and from which a tar
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -80,6 +80,7 @@ class Chunk:
     states: TrainState  # stacked over seeds
     metrics: Metrics  # leaves (seeds, epochs of the chunk)
     seconds: float  # wall time of the chunk
+    compile_seconds: float = 0.0  # before it
 
 
 def fresh_states(stage: Stage) -> TrainState:
@@ -181,11 +182,6 @@ def run_stage(
     """
     num_seeds, num_envs = len(stage.seeds), stage.learner.config.num_envs
     mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
-    is_new = checkpoint.latest(stage.directory) is None
-    first_epoch, states, stops = _resumed(stage, start)
-    if first_epoch:
-        on_resume(first_epoch)
-    states = parallel.place(states, mesh)
     description = checkpoint.describe(
         stage.learner.env,
         stage.learner.policy,
@@ -193,28 +189,24 @@ def run_stage(
         seeds=list(stage.seeds),
         **(meta or {}),
     )
+    is_new = checkpoint.latest(stage.directory) is None
+    first_epoch, states, stops = _resumed(stage, start)
+    if first_epoch:
+        on_resume(first_epoch)
+    states = parallel.place(states, mesh)
     if is_new:
         checkpoint.save(stage.directory, states, {**description, "epoch": 0})
     compile_seconds = train_seconds = 0.0
-    train: parallel.Train | None = None
-    length = _chunk_length(stage.epochs, first_epoch, chunk)
-    for epoch in range(first_epoch, stage.epochs, length):
-        if len(stops) == num_seeds:
-            break
-        if train is None:
-            began = time.perf_counter()
-            train = parallel.compile_train(stage.learner, mesh, length, states)
-            compile_seconds = time.perf_counter() - began
-        began = time.perf_counter()
-        states, metrics = jax.block_until_ready(train(states))
-        seconds = time.perf_counter() - began
-        train_seconds += seconds
-        done = epoch + length
-        on_chunk(Chunk(epoch, done, states, jax.device_get(metrics), seconds))
-        for stop in _new_stops(stage, states, metrics, stops):
+    chunks = _chunks(stage, mesh, states, first_epoch, chunk)
+    while len(stops) < num_seeds and (news := next(chunks, None)) is not None:
+        states = news.states
+        compile_seconds += news.compile_seconds
+        train_seconds += news.seconds
+        on_chunk(news)
+        for stop in _new_stops(stage, news, stops):
             on_stop(stop)
             stops += (stop,)
-        told = {**description, "epoch": done, "stops": [asdict(stop) for stop in stops]}
+        told = {**description, "epoch": news.epoch, "stops": [asdict(stop) for stop in stops]}
         checkpoint.save(stage.directory, states, told)
         if stop_asked():
             raise KeyboardInterrupt
@@ -226,12 +218,26 @@ def run_stage(
     return StageResult(states, first_epoch, compile_seconds, train_seconds, stops)
 
 
-def _new_stops(
-    stage: Stage, states: TrainState, metrics: Metrics, known: tuple[Stop, ...]
-) -> list[Stop]:
+def _chunks(
+    stage: Stage, mesh: Mesh, states: TrainState, first_epoch: int, longest: int
+) -> Iterator[Chunk]:
+    """Trains from `first_epoch` to the stage's end; compiles when the first chunk is asked for."""
+    length = _chunk_length(stage.epochs, first_epoch, longest)
+    train: parallel.Train | None = None
+    for epoch in range(first_epoch, stage.epochs, length):
+        began = time.perf_counter()
+        train = train or parallel.compile_train(stage.learner, mesh, length, states)
+        compiled = time.perf_counter()
+        states, metrics = jax.block_until_ready(train(states))
+        seconds = time.perf_counter() - compiled
+        news = jax.device_get(metrics)
+        yield Chunk(epoch, epoch + length, states, news, seconds, compiled - began)
+
+
+def _new_stops(stage: Stage, news: Chunk, known: tuple[Stop, ...]) -> list[Stop]:
     """Seeds that have stopped; the number of updates they have taken says when."""
     stopped = {stop.seed for stop in known}
-    faults, updates = (np.asarray(x) for x in jax.device_get((metrics.fault, states.updates)))
+    faults, updates = np.asarray(news.metrics.fault), np.asarray(news.states.updates)
     return [
         Stop(
             seed,
