@@ -182,13 +182,8 @@ def run_stage(
     """
     num_seeds, num_envs = len(stage.seeds), stage.learner.config.num_envs
     mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
-    description = checkpoint.describe(
-        stage.learner.env,
-        stage.learner.policy,
-        arm=stage.arm,
-        seeds=list(stage.seeds),
-        **(meta or {}),
-    )
+    about: dict[str, Any] = {"arm": stage.arm, "seeds": list(stage.seeds), **(meta or {})}
+    description = checkpoint.describe(stage.learner.env, stage.learner.policy, **about)
     is_new = checkpoint.latest(stage.directory) is None
     first_epoch, states, stops = _resumed(stage, start)
     if first_epoch:
