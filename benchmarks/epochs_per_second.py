@@ -138,7 +138,6 @@ def run_worker(worker: Worker) -> dict[str, Any]:
     from sumajax.learning import parallel
 
     parallel.use_cpu_devices(worker.devices)
-    import jax
     from matrix_products import product_rate, step_products
     from multiply_adds import of_step
 
@@ -157,14 +156,7 @@ def run_worker(worker: Worker) -> dict[str, Any]:
     compiled = time.perf_counter() - began
     if worker.only_compile:
         return {"compile_seconds_cold": compiled}
-    states, _ = jax.block_until_ready(train(states))
-    steps = worker.seeds * worker.epochs * EPOCH_STEPS
-    rates, costs = [], []
-    for _ in range(worker.repeats):
-        wall, cpu = time.perf_counter(), time.process_time()
-        states, _ = jax.block_until_ready(train(states))
-        rates.append(steps / (time.perf_counter() - wall))
-        costs.append((time.process_time() - cpu) / steps * 1e6)
+    rates, costs = timed(train, states, worker)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     per_device = num_envs // mesh.shape[parallel.ENVS]
     rate = product_rate(step_products(env, policy, per_device), mesh)
@@ -189,6 +181,23 @@ def run_worker(worker: Worker) -> dict[str, Any]:
         "matmul_gflops_per_second": rate.median / 1e9,
         "megaflops_per_step": flops / 1e6,
     }
+
+
+def timed(train: Any, states: Any, worker: Worker) -> tuple[list[float], list[float]]:
+    """Environment steps/s and CPU microseconds per step of each repeat, after one warm-up call."""
+    import jax
+
+    from sumajax.learning import EPOCH_STEPS
+
+    states, _ = jax.block_until_ready(train(states))
+    steps = worker.seeds * worker.epochs * EPOCH_STEPS
+    rates, costs = [], []
+    for _ in range(worker.repeats):
+        wall, cpu = time.perf_counter(), time.process_time()
+        states, _ = jax.block_until_ready(train(states))
+        rates.append(steps / (time.perf_counter() - wall))
+        costs.append((time.process_time() - cpu) / steps * 1e6)
+    return rates, costs
 
 
 def make_task(name: TaskName) -> Any:

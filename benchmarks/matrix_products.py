@@ -88,7 +88,7 @@ def _product(equation: JaxprEqn) -> Product:
     (contract_left, contract_right), (batch_left, batch_right) = equation.params[
         "dimension_numbers"
     ]
-    left, right = (variable.aval.shape for variable in equation.invars)
+    left, right = (variable.aval.shape for variable in equation.invars)  # type: ignore[attr-defined]
     return Product(
         batch=math.prod(left[i] for i in batch_left),
         m=math.prod(n for i, n in enumerate(left) if i not in (*contract_left, *batch_left)),

@@ -221,32 +221,12 @@ def run_evaluation(config: EvaluateConfig) -> dict[str, Any]:
     Raises:
       ValueError, OSError: one sentence each, all that can be known before any episode is played.
     """
-    if not 1 <= config.episodes <= MAX_EPISODES:
-        raise ValueError(f"episodes must be 1 to {MAX_EPISODES}, got {config.episodes}.")
-    if not config.modes:
-        raise ValueError("modes must name sampled, greedy or both.")
-    for option, path in (("json", config.json), ("replay", config.replay)):
-        _check_new(option, path)
+    _check(config)
     trained = load(config)
     tasks = tasks_of(config, trained)
     for policy in trained:
         for task in tasks:
             policy.on(task)
-    results: list[dict[str, Any]] = []
-    for task in tasks:
-        bound: Any = shortest_path_steps(task, config.episodes)
-        entry: dict[str, Any] = {
-            "task": checkpoint.describe(task, trained[0].agents[0].policy)["task"],
-            "label": label(task),
-            "shortest_path_steps": float(np.mean(bound)),
-            "policies": {},
-        }
-        for policy in trained:
-            print(f"{label(task)}: {policy.name}", file=sys.stderr, flush=True)
-            entry["policies"][policy.name] = {
-                mode: play(policy, task, mode, config.episodes) for mode in config.modes
-            }
-        results.append(entry)
     report = {
         "path": str(config.path),
         "policies": {
@@ -258,7 +238,7 @@ def run_evaluation(config: EvaluateConfig) -> dict[str, Any]:
             }
             for policy in trained
         },
-        "tasks": results,
+        "tasks": [_play_all(config, trained, task) for task in tasks],
     }
     reporting.print_table(table(report), title=f"steps taken and success: {config.path}")
     if config.json is not None:
@@ -268,6 +248,34 @@ def run_evaluation(config: EvaluateConfig) -> dict[str, Any]:
         _check_new("replay", config.replay)
         _write_replay(config, trained[0], tasks[-1])
     return report
+
+
+def _check(config: EvaluateConfig) -> None:
+    if not 1 <= config.episodes <= MAX_EPISODES:
+        raise ValueError(f"episodes must be 1 to {MAX_EPISODES}, got {config.episodes}.")
+    if not config.modes:
+        raise ValueError("modes must name sampled, greedy or both.")
+    for option, path in (("json", config.json), ("replay", config.replay)):
+        _check_new(option, path)
+
+
+def _play_all(
+    config: EvaluateConfig, trained: Sequence[Trained], task: PredatorCapturePrey
+) -> dict[str, Any]:
+    """Every policy on one task, beside the bound of shortest paths."""
+    bound: Any = shortest_path_steps(task, config.episodes)
+    entry: dict[str, Any] = {
+        "task": checkpoint.describe(task, trained[0].agents[0].policy)["task"],
+        "label": label(task),
+        "shortest_path_steps": float(np.mean(bound)),
+        "policies": {},
+    }
+    for policy in trained:
+        print(f"{label(task)}: {policy.name}", file=sys.stderr, flush=True)
+        entry["policies"][policy.name] = {
+            mode: play(policy, task, mode, config.episodes) for mode in config.modes
+        }
+    return entry
 
 
 def table(report: dict[str, Any]) -> list[dict[str, Any]]:

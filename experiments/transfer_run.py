@@ -40,6 +40,7 @@ from sumajax.transfer import (
     saved_epoch,
     saved_parts,
     transferred_states,
+    untrained_parameters,
 )
 from sumajax.upsampling import Scale, StateUpsampled
 
@@ -297,6 +298,7 @@ class Recorder:
         self.evaluations = directory / "evaluations.csv"
         self.arms: dict[str, dict[str, Any]] = {}
         self.zero_shot: dict[str, dict[str, Any]] = {}
+        self.untrained: list[str] = []  # parameters that the source left as drawn
         self.params: dict[str, Any] = {}
         self.stops: dict[str, list[dict[str, Any]]] = {}
         self._cost: dict[str, tuple[np.ndarray, float]] = {}  # env steps (S,), seconds so far
@@ -334,9 +336,17 @@ class Recorder:
             **self.evaluate(stage, result.states.params),
         )
 
-    def look(self, params: Any) -> None:
-        """Evaluates the source's policy on the target, before any training there."""
+    def look(self, source: Path, params: Any) -> None:
+        """Evaluates the source's policy on the target, before any training there, and says which
+        of its parameters the source did not train.
+        """
         self.zero_shot = self.evaluate(self.run.stage(TRANSFER), params)
+        self.untrained = untrained_parameters(source, params)
+        if self.untrained:
+            self.progress.say(
+                f"{TRANSFER}: {len(self.untrained)} parameters are as random as they began, the "
+                f"source's team has no use for them: {', '.join(self.untrained)}."
+            )
 
     def evaluate(self, stage: Stage, params: Any) -> dict[str, dict[str, Any]]:
         """Held-out episodes, `sampled` and `greedy`."""
@@ -366,6 +376,7 @@ class Recorder:
             "comparison": metrics_file.comparison(rows, config.threshold),
             "zero_shot_greedy": self.zero_shot.get("greedy"),
             "references": references,
+            "untrained_in_source": self.untrained,
             **({"stops": self.stops} if self.stops else {}),
         }
         metrics_file.write_summary(self.directory / "summary.json", **summary)
@@ -589,7 +600,7 @@ def _lead(run: Run, arms: list[str]) -> dict[str, Any]:
             def transferred() -> TrainState:
                 return transferred_states(stage, source, carry_optimiser=config.carry_optimiser)
 
-            recorder.look(transferred().params)
+            recorder.look(source, transferred().params)
             recorder.train(TRANSFER, transferred)
         if SCRATCH in arms:
             recorder.train(SCRATCH, lambda: fresh_states(run.stage(SCRATCH)))

@@ -6,7 +6,7 @@ Of several hosts (`sumajax.hosts`) the first alone has files; all train.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from sumajax import checkpoint, hosts
 from sumajax.checkpoint import CheckpointError
 from sumajax.learning import parallel
 from sumajax.learning.guard import FAULTS
-from sumajax.learning.learner import Learner, Metrics, TrainState
+from sumajax.learning.learner import Learner, Metrics, TrainState, make_learner
 
 CHUNK = 5
 """Epochs of a compiled call: between two looks at the metrics, and between two checkpoints."""
@@ -82,6 +82,7 @@ class Chunk:
     states: TrainState  # stacked over seeds
     metrics: Metrics  # leaves (seeds, epochs of the chunk)
     seconds: float  # wall time of the chunk
+    compile_seconds: float = 0.0  # before it
 
 
 def fresh_states(stage: Stage) -> TrainState:
@@ -134,6 +135,27 @@ def saved_parts(stage: Stage, source: Path, *, carry_optimiser: bool = False) ->
     }
 
 
+def untrained_parameters(source: Path, params: Any) -> list[str]:
+    """Names of the parameters that training the source left as they were first drawn.
+
+    A team of two predators and one capture agent has nobody to train what passes between two
+    capture agents, and where there is one sender an attention weight is 1 whatever its parameters:
+    they enter the target stage as random as they began (algorithms.md 5.5).
+
+    Args:
+      params: what was transferred from `source`, leaves (seeds, ...).
+    """
+    meta = checkpoint.read_meta(source)
+    learner = make_learner(*checkpoint.rebuild(meta))
+    drawn = parallel.init_seeds(learner, list(meta.get("seeds", [0]))).params
+    pairs = zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(drawn), strict=True)
+    return [
+        "/".join(str(key.key) for key in path)
+        for (path, after), before in pairs
+        if np.array_equal(after, np.broadcast_to(before, after.shape))
+    ]
+
+
 def run_stage(
     stage: Stage,
     start: Callable[[], TrainState],
@@ -166,6 +188,8 @@ def run_stage(
     """
     num_seeds, num_envs = len(stage.seeds), stage.learner.config.num_envs
     mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
+    about: dict[str, Any] = {"arm": stage.arm, "seeds": list(stage.seeds), **(meta or {})}
+    description = checkpoint.describe(stage.learner.env, stage.learner.policy, **about)
     (is_new, first_epoch, stopped), whole = hosts.first_makes(
         lambda: _resumed(stage, start), lambda: jax.eval_shape(lambda: fresh_states(stage))
     )
@@ -173,38 +197,20 @@ def run_stage(
     if first_epoch:
         on_resume(first_epoch)
     states = parallel.place(whole, mesh)
-    description = checkpoint.describe(
-        stage.learner.env,
-        stage.learner.policy,
-        arm=stage.arm,
-        seeds=list(stage.seeds),
-        **(meta or {}),
-    )
     whole = whole if hosts.several() else states
     if is_new:
         hosts.first_does(partial(_save, stage, whole, {**description, "epoch": 0}))
     compile_seconds = train_seconds = 0.0
-    train: parallel.Train | None = None
-    length = _chunk_length(stage.epochs, first_epoch, chunk)
-    for epoch in range(first_epoch, stage.epochs, length):
-        if len(stops) == num_seeds:
-            break
-        if train is None:
-            began = time.perf_counter()
-            train = parallel.compile_train(stage.learner, mesh, length, states)
-            compile_seconds = time.perf_counter() - began
-        hosts.meet()
-        began = time.perf_counter()
-        states, metrics = jax.block_until_ready(train(states))
-        seconds = time.perf_counter() - began
-        train_seconds += seconds
-        done = epoch + length
-        whole, metrics = hosts.gathered((states, metrics))
-        on_chunk(Chunk(epoch, done, whole, jax.device_get(metrics), seconds))
-        for stop in _new_stops(stage, whole, metrics, stops):
+    chunks = _chunks(stage, mesh, states, first_epoch, chunk)
+    while len(stops) < num_seeds and (news := next(chunks, None)) is not None:
+        whole = news.states
+        compile_seconds += news.compile_seconds
+        train_seconds += news.seconds
+        on_chunk(news)
+        for stop in _new_stops(stage, news, stops):
             on_stop(stop)
             stops += (stop,)
-        told = {**description, "epoch": done, "stops": [asdict(stop) for stop in stops]}
+        told = {**description, "epoch": news.epoch, "stops": [asdict(stop) for stop in stops]}
         if hosts.first_does(partial(_save, stage, whole, told, stop_asked)):
             raise KeyboardInterrupt
     if len(stops) == num_seeds:
@@ -226,12 +232,28 @@ def _save(
     return stop_asked()
 
 
-def _new_stops(
-    stage: Stage, states: TrainState, metrics: Metrics, known: tuple[Stop, ...]
-) -> list[Stop]:
+def _chunks(
+    stage: Stage, mesh: Mesh, states: TrainState, first_epoch: int, longest: int
+) -> Iterator[Chunk]:
+    """Trains from `first_epoch` to the stage's end; compiles when the first chunk is asked for."""
+    length = _chunk_length(stage.epochs, first_epoch, longest)
+    train: parallel.Train | None = None
+    for epoch in range(first_epoch, stage.epochs, length):
+        began = time.perf_counter()
+        train = train or parallel.compile_train(stage.learner, mesh, length, states)
+        compiled = time.perf_counter()
+        hosts.meet()
+        met = time.perf_counter()
+        states, metrics = jax.block_until_ready(train(states))
+        seconds = time.perf_counter() - met
+        whole, news = hosts.gathered((states, metrics))
+        yield Chunk(epoch, epoch + length, whole, jax.device_get(news), seconds, compiled - began)
+
+
+def _new_stops(stage: Stage, news: Chunk, known: tuple[Stop, ...]) -> list[Stop]:
     """Seeds that have stopped; the number of updates they have taken says when."""
     stopped = {stop.seed for stop in known}
-    faults, updates = (np.asarray(x) for x in jax.device_get((metrics.fault, states.updates)))
+    faults, updates = np.asarray(news.metrics.fault), np.asarray(news.states.updates)
     return [
         Stop(
             seed,

@@ -8,18 +8,9 @@ os.environ["XLA_FLAGS"] = (
 ).strip()
 
 import jax
-import pytest
 
 
 def pytest_configure(config):
     """Compiled programs are shared by the tests of a run, its worker processes and later runs."""
     jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_cmdline_main(config):
-    """The whole suite is spread over the cores; a part of it, or a given `-n`, is left as it is."""
-    whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
-    if whole and config.pluginmanager.hasplugin("xdist") and config.option.numprocesses is None:
-        config.option.numprocesses = os.cpu_count()

@@ -12,8 +12,9 @@ def test_extending(capsys):
     shared: dict = {}
     for code in re.findall(r"```python\n(.*?)```", (DOCS / "extending.md").read_text(), re.DOTALL):
         exec(compile(code, "extending.md", "exec"), shared)
-    assert shared["metrics"].env_steps.tolist() == [20_000, 20_000]
-    assert shared["result"].success.mean() > 0.5  # random: 0.1
+    assert shared["metrics"].env_steps.tolist() == [20_000] * 10
+    assert shared["result"].success.mean() > 0.9  # measured: 1.0, a random policy 0.12
+    assert shared["metrics"].success[-1] > 0.9  # the memoryless policy's, in training: 1.0
     assert capsys.readouterr().out.count("steps taken") == 2
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from sumajax import checkpoint
 from sumajax.checkpoint import CheckpointError
-from sumajax.environments import PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import LearnerConfig, make_learner, parallel
 from sumajax.learning.guard import FAULTS
 from sumajax.learning.learner import Metrics
@@ -22,6 +22,7 @@ from sumajax.transfer import (
     fresh_states,
     run_stage,
     transferred_states,
+    untrained_parameters,
 )
 from sumajax.upsampling import StateUpsampled
 
@@ -202,3 +203,20 @@ def test_a_stop_that_is_asked_for_comes_after_a_checkpoint(tmp_path, monkeypatch
         )
     assert told == [2, 4]
     assert checkpoint.read_meta(tmp_path)["epoch"] == 4
+
+
+class TestUntrainedParameters:
+    def test_all_have_been_trained_where_the_team_uses_all(self, source):
+        stage, result = source
+        assert untrained_parameters(stage.directory, result.states.params) == []
+
+    def test_what_passes_between_capture_agents_waits_for_a_second_one(self, tmp_path):
+        env = StateUpsampled(PredatorCapturePrey(3, 2, 1, max_steps=10), 6)
+        policy = make_policy("hetnet", env)
+        alone = Stage("source", make_learner(env, policy, CONFIG), 1, (0, 1), tmp_path / "source")
+        params = run_stage(alone, lambda: fresh_states(alone)).states.params
+        left = untrained_parameters(alone.directory, params)
+        between = [name for name in left if "a2a" in name]
+        assert len(between) == 8  # weights and attention of both layers
+        # One sender a relation: its attention is 1, whatever the parameters.
+        assert {name.rsplit("_")[-1] for name in set(left) - set(between)} == {"src", "dst"}

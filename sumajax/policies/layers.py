@@ -13,10 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jax.nn.initializers import Initializer
+from jax.nn.initializers import Initializer, zeros
+
+HE_GAIN = 6**0.5
+"""Bound of a uniform distribution of variance 2, for inputs of which ReLU lets half through."""
 
 
-def uniform_fan_in(fan_in: int) -> Initializer:
+def uniform_fan_in(fan_in: float) -> Initializer:
     """U(-1/sqrt(fan_in), 1/sqrt(fan_in)), the default of the originals' layers."""
     bound = fan_in**-0.5
 
@@ -27,11 +30,18 @@ def uniform_fan_in(fan_in: int) -> Initializer:
 
 
 class Dense(nn.Module):
-    """x @ kernel + bias, initialised as in the originals; `fan_in` where the input is a part."""
+    """x @ kernel + bias, initialised as in the originals.
+
+    Attributes:
+      fan_in: of the initialisation, where the input is a part of what is added up, or mostly 0.
+      before_relu: initialise as He et al. 2015 instead, variance 2 / fan_in and no bias, so that a
+        stack of such layers neither loses its input nor hides it behind a constant.
+    """
 
     features: int
     use_bias: bool = True
     fan_in: int | None = None
+    before_relu: bool = False
 
     def __call__(self, x: chex.Array) -> chex.Array:
         kernel, bias = self.weights(x.shape[-1])
@@ -41,8 +51,11 @@ class Dense(nn.Module):
     def weights(self, in_features: int) -> tuple[chex.Array, chex.Array | None]:
         """kernel (in_features, features) and bias (features,)."""
         init = uniform_fan_in(self.fan_in or in_features)
+        bias_init: Initializer = init
+        if self.before_relu:
+            init, bias_init = uniform_fan_in((self.fan_in or in_features) / HE_GAIN**2), zeros
         kernel = self.param("kernel", init, (in_features, self.features))
-        return kernel, self.param("bias", init, (self.features,)) if self.use_bias else None
+        return kernel, self.param("bias", bias_init, (self.features,)) if self.use_bias else None
 
 
 def side_by_side(layers: Sequence[Dense], x: chex.Array) -> list[chex.Array]:

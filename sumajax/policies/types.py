@@ -5,6 +5,7 @@ pairs it with the task's shapes and is what users and the learner hold. All para
 the agents of a class and none depends on how many there are: the same parameters act for any N.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -86,15 +87,16 @@ class TeamSpec:
         return self.agent_class.count(agent_class)
 
 
-class PolicyModule(nn.Module):
+class PolicyModule(nn.Module, ABC):
     """What a policy file implements. `...` stands for any batch axes, usually E environments."""
 
     team: TeamSpec
 
+    @abstractmethod
     def encode_states(self, states: chex.Array) -> chex.Array:
         """(S, 1, rows, columns) state tensors -> (S, F) features, whatever `__call__` expects."""
-        raise NotImplementedError
 
+    @abstractmethod
     def __call__(
         self, carry: Any, state_features: chex.Array, view: chex.Array, noise: Any
     ) -> tuple[Any, PolicyOutput]:
@@ -106,15 +108,14 @@ class PolicyModule(nn.Module):
           view: (..., N, c, m, m).
           noise: from `sample_noise`; all zeros make every choice greedy.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def initial_carry(self, batch_shape: tuple[int, ...]) -> Any:
         """Memory at the start of an episode, leading axes `batch_shape`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         """All the random numbers of `__call__`, so that a rollout can draw them in one go."""
-        raise NotImplementedError
 
     def encode_and_step(self, carry: Any, obs: Observation, noise: Any) -> tuple[Any, PolicyOutput]:
         """`__call__` on the state tensors themselves: the direct path, for any state."""

@@ -110,7 +110,9 @@ class TestGradient:
         """
         env = PredatorPrey(size=3, num_predators=2, max_steps=4)
         with jax.enable_x64(True):
-            tiny = tiny_learner(env, "ic3net", num_envs=5, rollout_length=8, mask_inactive=True)
+            plain = {"advantages": "raw", "team_reward": 0.0}
+            tiny = tiny_learner(env, "ic3net", num_envs=5, rollout_length=8, **plain)
+            assert tiny.config.mask_inactive
             params, actors, draws, _ = in_float64(jax.jit(partial(gradient_inputs, tiny))())
             ours, (_, tally) = jax.jit(tiny._gradient)(params, actors, draws, jnp.int32(0))
             following, now = jax.jit(partial(rollout, env, tiny.policy))(params, actors, draws)
