@@ -196,7 +196,12 @@ class Run:
             else (config.target, self.target_policy, config.target_epochs)
         )
         anneal = epochs if config.preset == "fast" and not config.learner.anneal_epochs else 0
-        learner = replace(config.learner, anneal_epochs=anneal or config.learner.anneal_epochs)
+        rate = config.learner.learning_rate
+        learner = replace(
+            config.learner,
+            anneal_epochs=anneal or config.learner.anneal_epochs,
+            learning_rate=rate * config.learner.transfer_rate if arm == TRANSFER else rate,
+        )
         return Stage(
             arm, make_learner(env, policy, learner), epochs, config.seeds, self.checkpoints(arm)
         )
