@@ -30,6 +30,7 @@ from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES, evaluate, evaluate_random, shortest_path_steps
 from sumajax.learning import EPOCH_STEPS, LearnerConfig, TrainState, make_learner, parallel
 from sumajax.policies import Policy, make_policy
+from sumajax.policies.encoder import EncoderKind
 from sumajax.reporting import metrics as metrics_file
 from sumajax.reporting.loggers import LoggerName, Loggers, check_installed
 from sumajax.transfer import (
@@ -42,8 +43,9 @@ from sumajax.transfer import (
     transferred_states,
     untrained_parameters,
 )
-from sumajax.upsampling import Scale, StateUpsampled
+from sumajax.upsampling import Fill, Scale, StateUpsampled
 
+Upsampling = Literal["blocks", "corner", "none"]
 SOURCE, TRANSFER, SCRATCH = "source", "transfer", "scratch"
 MAX_EPOCHS = 100_000
 """Updates are counted in 32 bits, and an epoch has at most 20,000."""
@@ -83,8 +85,15 @@ class TransferConfig:
     """Directory of the run; runs/<experiment>-<policy>-<preset> if not given."""
     scale: Scale = "none"
     """What upsampling does to the state's mass: none (the paper), or mass (blocks sum to one)."""
+    upsampling: Upsampling = "blocks"
+    """blocks: the paper's. corner: the small state as it is, zeros around it. none: the small state
+    alone, which only the encoder lab_gap can take to another grid."""
+    encoder: EncoderKind = "flat"
+    """How the policy reads the state: flat, lab_gap (pools over the grid) or linear."""
     carry_optimiser: bool = False
     """Carry the optimiser's memory over with the parameters."""
+    leave_out: tuple[str, ...] = ()
+    """Modules of the policy whose parameters are not carried over, as state_encoder."""
     evaluate_every: int = 15
     """Epochs between held-out evaluations while a target arm trains; 0 for none."""
     threshold: float = 20.0
@@ -118,11 +127,7 @@ class TransferConfig:
                     f"{name.removeprefix('num_').replace('_', '-')} must lie between {least} and "
                     f"{most}, got {getattr(self, name)}."
                 )
-        fits = all(0 <= seed < 2**31 for seed in self.seeds)
-        if not self.seeds or not fits or len(set(self.seeds)) != len(self.seeds):
-            raise ValueError(
-                f"seeds must be distinct numbers from 0 to {2**31 - 1}, got {list(self.seeds)}."
-            )
+        check_seeds(self.seeds)
         if not 0 < self.threshold < float("inf"):
             raise ValueError(f"threshold must be a number greater than 0, got {self.threshold}.")
         if self.source_checkpoint is not None and not self.target_epochs:
@@ -152,6 +157,14 @@ class TransferConfig:
         return self.output or Path("runs") / f"{self.experiment}-{self.policy}-{self.preset}"
 
 
+def check_seeds(seeds: tuple[int, ...]) -> None:
+    """Refuses none, doubles and what does not fit into 31 bits."""
+    if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= s < 2**31 for s in seeds):
+        raise ValueError(
+            f"seeds must be distinct numbers from 0 to {2**31 - 1}, got {list(seeds)}."
+        )
+
+
 @dataclass(frozen=True)
 class Run:
     """An experiment that has been checked: its tasks, its policy for each, its directory."""
@@ -165,8 +178,11 @@ class Run:
     def of(cls, config: TransferConfig) -> "Run":
         """Builds both tasks and policies, and refuses what cannot be transferred."""
         check_installed(config.log)
-        source = StateUpsampled(config.source, config.target.size, config.scale)
-        policies = [make_policy(config.policy, env) for env in (source, config.target)]
+        seen_at = config.source if config.upsampling == "none" else config.target
+        fill: Fill = "corner" if config.upsampling == "corner" else "blocks"
+        source = StateUpsampled(config.source, seen_at.size, config.scale, fill)
+        settings = {} if config.encoder == "flat" else {"encoder": config.encoder}
+        policies = [make_policy(config.policy, env, **settings) for env in (source, config.target)]
         run = cls(config, source, *policies)
         checkpoint.check_compatible(
             checkpoint.describe(source, run.source_policy),
@@ -198,7 +214,12 @@ class Run:
             else (config.target, self.target_policy, config.target_epochs)
         )
         anneal = epochs if config.preset == "fast" and not config.learner.anneal_epochs else 0
-        learner = replace(config.learner, anneal_epochs=anneal or config.learner.anneal_epochs)
+        rate = config.learner.learning_rate
+        learner = replace(
+            config.learner,
+            anneal_epochs=anneal or config.learner.anneal_epochs,
+            learning_rate=rate * config.learner.transfer_rate if arm == TRANSFER else rate,
+        )
         return Stage(
             arm, make_learner(env, policy, learner), epochs, config.seeds, self.checkpoints(arm)
         )
@@ -239,7 +260,7 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
                 path.unlink()
         reporting.write_json(
             directory / "config.json",
-            {"command": sys.argv, "options": described, "versions": _versions()},
+            {"command": sys.argv, "options": described, "versions": versions()},
         )
         yield directory
     finally:
@@ -341,7 +362,12 @@ class Recorder:
         of its parameters the source did not train.
         """
         self.zero_shot = self.evaluate(self.run.stage(TRANSFER), params)
-        self.untrained = untrained_parameters(source, params)
+        config = self.run.config
+        self.untrained = [
+            name
+            for name in untrained_parameters(source, params, config.seeds)
+            if not set(name.split("/")) & set(config.leave_out)
+        ]
         if self.untrained:
             self.progress.say(
                 f"{TRANSFER}: {len(self.untrained)} parameters are as random as they began, the "
@@ -526,7 +552,7 @@ def _plain(value: Any) -> Any:
     return json.loads(json.dumps(value, default=str))
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
     packages = ("sumajax", "jax", "flax", "optax", "orbax-checkpoint", "numpy")
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
@@ -598,7 +624,12 @@ def _lead(run: Run, arms: list[str]) -> dict[str, Any]:
             stage = run.stage(TRANSFER)
 
             def transferred() -> TrainState:
-                return transferred_states(stage, source, carry_optimiser=config.carry_optimiser)
+                return transferred_states(
+                    stage,
+                    source,
+                    carry_optimiser=config.carry_optimiser,
+                    leave_out=config.leave_out,
+                )
 
             recorder.look(source, transferred().params)
             recorder.train(TRANSFER, transferred)

@@ -22,6 +22,9 @@ from sumajax.upsampling import StateUpsampled
 MAX_SETTING, MAX_CELLS = 10_000, 10_000_000
 """Whole numbers, and cells of the grid, of a task or policy that is built from a file."""
 
+POOLED_ENCODERS = ("lab_gap",)
+"""Encoders that pool over the grid: their parameters fit any."""
+
 TASKS: dict[str, type] = {
     cls.__name__: cls for cls in (PredatorPrey, PredatorCapturePrey, StateUpsampled)
 }
@@ -146,6 +149,8 @@ def _compared(
         env.num_actions,
         "use tasks with the same actions in both stages",
     )
+    if _settings(policy).get("encoder") in POOLED_ENCODERS:
+        return
     yield (
         "the policy's grid",
         _sides(saved["state_shape"]),

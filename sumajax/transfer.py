@@ -90,14 +90,25 @@ def fresh_states(stage: Stage) -> TrainState:
     return parallel.init_seeds(stage.learner, list(stage.seeds))
 
 
-def transferred_states(stage: Stage, source: Path, *, carry_optimiser: bool = False) -> TrainState:
+def transferred_states(
+    stage: Stage,
+    source: Path,
+    *,
+    carry_optimiser: bool = False,
+    leave_out: tuple[str, ...] = (),
+) -> TrainState:
     """States that start from the parameters in the checkpoints of another stage.
 
     Everything else, memory and environments included, is fresh; the optimiser's memory too unless
-    `carry_optimiser`. Seed i starts from the source's seed i, or all from its only one.
+    `carry_optimiser`. A seed starts from the source's seed of that number; where the source has not
+    all of them, seed i starts from its i-th, or all from its only one.
+
+    Args:
+      leave_out: modules of the policy whose parameters stay fresh, as `state_encoder`.
 
     Raises:
       CheckpointError: as for `saved_parts`.
+      ValueError: for a module that the policy does not have.
     """
     fresh = fresh_states(stage)
     saved = saved_parts(stage, source, carry_optimiser=carry_optimiser)
@@ -107,7 +118,23 @@ def transferred_states(stage: Stage, source: Path, *, carry_optimiser: bool = Fa
         )
         for field, part in saved.items()
     }
+    carried["params"] = _without(carried["params"], fresh.params, leave_out)
     return replace(fresh, **carried)
+
+
+def _without(params: Any, fresh: Any, modules: tuple[str, ...]) -> Any:
+    """`params`, but of `modules` the `fresh` ones."""
+    within = {
+        path: {str(key.key) for key in path[:-1]}
+        for path, _ in jax.tree_util.tree_leaves_with_path(params)
+    }
+    known = sorted(set().union(*within.values()) - {"params"})
+    for module in modules:
+        if module not in known:
+            raise ValueError(f"the policy has no module {module!r}; it has {', '.join(known)}.")
+    return jax.tree_util.tree_map_with_path(
+        lambda path, x, y: y if within[path] & set(modules) else x, params, fresh
+    )
 
 
 def saved_parts(stage: Stage, source: Path, *, carry_optimiser: bool = False) -> dict[str, Any]:
@@ -120,7 +147,8 @@ def saved_parts(stage: Stage, source: Path, *, carry_optimiser: bool = False) ->
     learner, meta = stage.learner, checkpoint.read_meta(source)
     checkpoint.check_compatible(meta, learner.env, learner.policy, source)
     saved_seeds = meta.get("seeds", [0])
-    if len(saved_seeds) not in (1, len(stage.seeds)):
+    by_number = set(stage.seeds) <= set(saved_seeds)
+    if not by_number and len(saved_seeds) not in (1, len(stage.seeds)):
         raise CheckpointError(
             f"{source} holds {len(saved_seeds)} seeds, this stage has {len(stage.seeds)}; train as "
             "many, or transfer from one seed."
@@ -130,12 +158,18 @@ def saved_parts(stage: Stage, source: Path, *, carry_optimiser: bool = False) ->
         jax.eval_shape(lambda: fresh_states(stage)),
     )
     fields = ("params", "opt_state") if carry_optimiser else ("params",)
-    return {
+    saved = {
         field: checkpoint.load_params(source, getattr(like, field), field=field) for field in fields
     }
+    if not by_number:
+        return saved
+    places = np.array([saved_seeds.index(seed) for seed in stage.seeds])
+    return jax.tree.map(lambda x: x[places], saved)
 
 
-def untrained_parameters(source: Path, params: Any) -> list[str]:
+def untrained_parameters(
+    source: Path, params: Any, seeds: tuple[int, ...] | None = None
+) -> list[str]:
     """Names of the parameters that training the source left as they were first drawn.
 
     A team of two predators and one capture agent has nobody to train what passes between two
@@ -144,10 +178,13 @@ def untrained_parameters(source: Path, params: Any) -> list[str]:
 
     Args:
       params: what was transferred from `source`, leaves (seeds, ...).
+      seeds: whose they are, where they may be some of the source's.
     """
     meta = checkpoint.read_meta(source)
     learner = make_learner(*checkpoint.rebuild(meta))
-    drawn = parallel.init_seeds(learner, list(meta.get("seeds", [0]))).params
+    saved_seeds = meta.get("seeds", [0])
+    by_number = seeds is not None and set(seeds) <= set(saved_seeds)
+    drawn = parallel.init_seeds(learner, list(seeds if by_number and seeds else saved_seeds)).params
     pairs = zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(drawn), strict=True)
     return [
         "/".join(str(key.key) for key in path)

@@ -12,6 +12,8 @@ from sumajax.environments.grid import grid_size, plain_size
 from sumajax.environments.types import Environment, Observation, Transition
 
 Scale = Literal["none", "mass"]
+Fill = Literal["blocks", "corner"]
+"""How a small state fills a large one."""
 
 
 def upsample(state: chex.Array, factor: int | tuple[int, int]) -> chex.Array:
@@ -38,6 +40,10 @@ class StateUpsampled:
     `size`. With `scale="mass"` a block sums to what its cell held (1/f^2 each), otherwise, as in
     the paper, each of its cells holds that value.
 
+    With `fill="corner"` nothing is upsampled: the small state stands as it is in the first rows and
+    columns of the large one, zeros around it. It is the control that tells what upsampling adds to
+    a mere fit of the shapes.
+
     Raises:
       ValueError: when `size` is no size, or no whole multiple of the grid of `env`.
     """
@@ -45,13 +51,16 @@ class StateUpsampled:
     env: Environment
     size: int | tuple[int, int]
     scale: Scale = "none"
+    fill: Fill = "blocks"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "size", plain_size(self.size))
-        if self.scale not in get_args(Scale):
-            raise ValueError(
-                f"scale {self.scale!r} is unknown; choose one of {', '.join(get_args(Scale))}."
-            )
+        for name, choices in (("scale", get_args(Scale)), ("fill", get_args(Fill))):
+            value = getattr(self, name)
+            if value not in choices:
+                raise ValueError(
+                    f"{name} {value!r} is unknown; choose one of {', '.join(choices)}."
+                )
         rows, columns = grid_size(self.size)
         source_rows, source_columns = self.env.state_shape[1:]
         if rows % source_rows or columns % source_columns:
@@ -128,5 +137,8 @@ class StateUpsampled:
         return self.env.shortest_steps(state)  # type: ignore[attr-defined]
 
     def _transform(self, state: chex.Array) -> chex.Array:
+        if self.fill == "corner":
+            around = [(0, n - m) for n, m in zip(self.state_shape, state.shape[-3:], strict=True)]
+            return jnp.pad(state, [(0, 0)] * (state.ndim - 3) + around)
         large = upsample(state, self.factor)
         return large / (self.factor[0] * self.factor[1]) if self.scale == "mass" else large

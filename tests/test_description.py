@@ -58,6 +58,12 @@ def test_what_differs_between_stages_is_named_with_both_values(target, name, set
     assert all(word in sentence for word in [*words, "runs/x"]), sentence
 
 
+def test_an_encoder_that_pools_fits_any_grid():
+    small, large = PredatorPrey(5), PredatorPrey(10)
+    policies = [make_policy("ic3net", env, encoder="lab_gap") for env in (small, large)]
+    check_compatible(describe(small, policies[0]), large, policies[1])
+
+
 def test_number_of_actions():
     env = PredatorPrey(10)
     policy = make_policy("ic3net", env)

@@ -79,6 +79,28 @@ def test_one_source_seed_serves_several(source, tmp_path):
             np.testing.assert_array_equal(copy, of_source[0])
 
 
+def test_some_of_the_sources_seeds_go_on_by_their_number(source, tmp_path):
+    trained, result = source
+    states = transferred_states(stage(TARGET, tmp_path, seeds=(1,)), trained.directory)
+    second = jax.tree.map(lambda x: x[1:], result.states.params)
+    assert equal(states.params, second)
+    assert untrained_parameters(trained.directory, states.params, (1,)) == []
+
+
+def test_modules_that_are_left_out_stay_fresh(source, tmp_path):
+    trained, result = source
+    target = stage(TARGET, tmp_path)
+    params = transferred_states(target, trained.directory, leave_out=("state_encoder",)).params
+    fresh = fresh_states(target).params["params"]
+    carried = result.states.params["params"]
+    left = params["params"]
+    assert equal(left["observation"]["state_encoder"], fresh["observation"]["state_encoder"])
+    assert equal(left["observation"]["view_encoder"], carried["observation"]["view_encoder"])
+    assert equal(left["core"], carried["core"])
+    with pytest.raises(ValueError, match=r"no module 'ear'; it has .*state_encoder"):
+        transferred_states(target, trained.directory, leave_out=("ear",))
+
+
 def test_other_numbers_of_seeds_are_refused(source, tmp_path):
     with pytest.raises(CheckpointError, match="holds 2 seeds, this stage has 3"):
         transferred_states(stage(TARGET, tmp_path, seeds=(0, 1, 2)), source[0].directory)

@@ -159,6 +159,20 @@ class TestStateUpsampled:
         with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
             StateUpsampled(PredatorPrey(size=5), size=size)
 
+    def test_in_the_corner_nothing_is_upsampled(self):
+        env = PredatorPrey(size=2, num_predators=2)
+        cornered = StateUpsampled(env, size=4, fill="corner")
+        small, large = env.state_table(), cornered.state_table()
+        assert large.shape == (4, 1, 4, 4)
+        np.testing.assert_array_equal(large[:, :, :2, :2], small)
+        assert large.sum() == small.sum()
+        state = env.reset(jax.random.key(0))
+        assert cornered.observe(state).state.shape == (2, 1, 4, 4)
+
+    def test_an_unknown_fill_is_refused(self):
+        with pytest.raises(ValueError, match="fill 'middle' is unknown; choose one of blocks, c"):
+            StateUpsampled(PredatorPrey(size=2, num_predators=2), size=4, fill="middle")
+
     def test_an_unknown_scale_is_refused(self):
         sentence = "scale 'sum' is unknown; choose one of none, mass."
         with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):

@@ -37,6 +37,8 @@ class LearnerConfig:
       value_weight, policy_weight, entropy_weight: of the critic's squared error, of the policy
         gradient and of the entropy bonus.
       optimiser, learning_rate: Adam, or RMSprop as the originals set it.
+      transfer_rate: the learning rate after a transfer, as a share of `learning_rate`: what the
+        source has learnt is to be bent, not to be learnt anew.
       max_grad_norm: clip of the gradient's global norm; None is no clipping.
       clip_per_env: clip each environment's gradient alone before they are added, as processes do.
       warmup_epochs: the learning rate rises linearly from 0 over this many epochs.
@@ -64,6 +66,7 @@ class LearnerConfig:
     entropy_weight: float = 0.004
     optimiser: Optimiser = "adam"
     learning_rate: float = 1.5e-3
+    transfer_rate: float = 0.5
     max_grad_norm: float | None = 0.5
     clip_per_env: bool = False
     warmup_epochs: int = 0
@@ -94,6 +97,7 @@ _PUBLISHED: dict[str, Any] = {
     "entropy_weight": 0.0,
     "optimiser": "rmsprop",
     "learning_rate": 1e-3,
+    "transfer_rate": 1.0,
     "max_grad_norm": None,
     "detach_gap": 10,
 }
@@ -168,6 +172,7 @@ _NUMBERS: dict[str, tuple[Callable[[float], bool], str]] = {
     "gae_lambda": _UNIT,
     "team_reward": _UNIT,
     "anneal_to": _UNIT,
+    "transfer_rate": _POSITIVE,
     "value_weight": _WEIGHT,
     "policy_weight": _WEIGHT,
     "entropy_weight": _WEIGHT,
