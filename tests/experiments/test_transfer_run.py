@@ -59,6 +59,15 @@ def without_clock(directory):
     return [{name: row[name] for name in row if name != "seconds"} for row in rows(directory)]
 
 
+def test_the_rate_is_lower_after_a_transfer(toy):
+    run = transfer_run.Run.of(toy)
+    arms = ("source", "transfer", "scratch")
+    rates = {arm: run.stage(arm).learner.config.learning_rate for arm in arms}
+    full = toy.learner.learning_rate
+    assert rates == {"source": full, "transfer": toy.learner.transfer_rate * full, "scratch": full}
+    assert rates["transfer"] < full
+
+
 def test_a_run_from_start_to_end(toy, capsys):
     summary = transfer_run.run_experiment(toy)
     directory = toy.directory

@@ -103,6 +103,7 @@ REFUSED = [
     ({"policy_weight": -1.0}, "policy_weight must be a finite number of at least 0, got -1.0."),
     ({"entropy_weight": -0.01}, "entropy_weight must be a finite number of at least 0, got -0.01."),
     ({"learning_rate": 0.0}, "learning_rate must be a finite number greater than 0, got 0.0."),
+    ({"transfer_rate": 0.0}, "transfer_rate must be a finite number greater than 0, got 0.0."),
     ({"learning_rate": None}, "learning_rate must be a finite number greater than 0, got None."),
     ({"learning_rate": 1e999}, "learning_rate must be a finite number greater than 0, got inf."),
     ({"value_weight": 1e999}, "value_weight must be a finite number of at least 0, got inf."),
