@@ -90,6 +90,15 @@ def test_dense_starts_uniform_in_its_fan_in():
         assert 0.8 * bound < jnp.abs(weights["bias"]).max() <= bound
 
 
+def test_dense_before_a_relu_keeps_the_size_of_its_input():
+    """He et al. 2015: the mean square after the ReLU is that of the input; no bias."""
+    x = jax.random.normal(jax.random.key(0), (500, 300))
+    layer = Dense(400, before_relu=True)
+    params = layer.init(jax.random.key(1), x)
+    assert not params["params"]["bias"].any()
+    np.testing.assert_allclose((jax.nn.relu(layer.apply(params, x)) ** 2).mean(), 1.0, rtol=0.03)
+
+
 def test_dense_without_bias_is_linear():
     layer = Dense(3, use_bias=False)
     params = layer.init(jax.random.key(0), jnp.ones((1, 2)))
