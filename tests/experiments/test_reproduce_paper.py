@@ -176,14 +176,14 @@ class TestClaims:
         found = self.verdicts()
         assert found["Q1, PP, IC3Net on the source: upsampling does no harm"] == HOLDS
         assert found["Q2, PP, IC3Net, 10x10 5P"] == HOLDS
-        assert found["Up to 7.88x"] == IN_PART
+        assert found["Up to 7.88x"] == NOT_RUN  # the other rows may be larger
         assert found["Scratch fails where transfer succeeds"] == NOT_RUN
         assert found["Q2, PP, MAGIC, 10x10 5P"] == NOT_RUN
 
     def test_a_smaller_ratio_holds_in_part_and_none_does_not(self):
         q2 = "Q2, PP, IC3Net, 10x10 5P"
         assert self.verdicts(scratch=[[40] * 252] * 3)[q2] == IN_PART
-        assert self.verdicts(scratch=[[20] * 252] * 3)[q2] == FAILS
+        assert self.verdicts(scratch=[[21] * 252] * 3)[q2] == FAILS
         assert self.verdicts(scratch=[[60] * 252] * 2)[q2] == IN_PART  # too few seeds
         assert self.verdicts(scratch=[[60] * 99] * 3)[q2] == IN_PART  # too short
 
@@ -346,6 +346,7 @@ def pretend(directory, arm, epochs):
 
 def test_only_what_is_missing_is_run(tiny, monkeypatch):
     ran = []
+    monkeypatch.setattr(paper_parts, "ABLATED", ("pp-ic3net",))
 
     def run_experiment(config):
         arm = "transfer" if config.source_checkpoint else "source"

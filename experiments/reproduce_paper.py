@@ -1,0 +1,390 @@
+"""The paper's evidence in one command: Tables I and II, Figure 2, ablations, claim by claim.
+
+python experiments/reproduce_paper.py                                 # Table I and Q1, preset fast
+python experiments/reproduce_paper.py --experiments pp-hetnet --seeds 0 1 2 3 4
+python experiments/reproduce_paper.py --rebuild                       # tables and figures alone
+
+Stop it when you like; the same command goes on, and what is finished is not run again.
+"""
+
+import json
+import os
+import shlex
+import sys
+import time
+from collections.abc import Iterable
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from command_line import parse, plain_errors, prepare_jax
+from filelock import FileLock, Timeout
+from paper_parts import (
+    SELECTIONS,
+    TABLE_1,
+    Budget,
+    Part,
+    PresetName,
+    Selection,
+    config_of,
+    directory_of,
+    parts_of,
+    seeds_of,
+)
+from paper_report import PROVENANCE, write_report
+from paper_results import (
+    FinishedRun,
+    Results,
+    changed_settings,
+    commit,
+    machine,
+    recognised,
+)
+from transfer_run import MAX_DEVICES, MAX_EPOCHS, SOURCE, check_seeds, run_experiment, versions
+
+from sumajax import checkpoint
+from sumajax.reporting import write_json
+from sumajax.transfer import StoppedError
+
+RESULTS = Path(__file__).parent / "results"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Reruns the paper's experiments and writes its tables and figures with ours beside them."""
+
+    experiments: tuple[Selection, ...] = TABLE_1
+    """Rows of Table I; q1: the source tasks without upsampling; and the ablations of PP with IC3Net
+    and HetNet: corner, mass, encoder, optimiser, short-source, lab-gap."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Trained side by side; seeds that are added later are run alone."""
+    preset: PresetName = "fast"
+    """fast: this package's learner and 1.0 M source steps. paper: the originals' procedure and the
+    paper's budgets."""
+    epochs_scale: float = 1.0
+    """Factor on the preset's epochs."""
+    source_epochs: int | None = None
+    """Epochs of every source instead of the preset's."""
+    target_epochs: int | None = None
+    """Epochs of every target arm instead of the preset's."""
+    devices: int | None = None
+    """CPU devices to use at most; None: one per core."""
+    output: Path = RESULTS
+    """Where the CSV files, tables, figures and the report are kept."""
+    runs: Path = Path("runs/reproduce_paper")
+    """Where the run directories with their checkpoints are."""
+    rebuild: bool = False
+    """Train nothing; make tables, figures and report again from the CSV files in output."""
+    import_runs: tuple[Path, ...] = ()
+    """Train nothing; keep the finished arms of these runs of pp_transfer.py or pcp_transfer.py."""
+    import_commit: str = "unknown"
+    """The commit that the imported runs are of, which they do not say themselves."""
+    measure_speed: bool = False
+    """Train nothing; measure Table II for the chosen experiments, with nothing else running."""
+    speed_epochs: int = 100
+    """Epochs that a row of Table II is measured over."""
+
+    def __post_init__(self) -> None:
+        if not self.experiments or len(set(self.experiments)) != len(self.experiments):
+            raise ValueError(
+                f"experiments must be distinct names of {', '.join(SELECTIONS)}, "
+                f"got {list(self.experiments)}."
+            )
+        check_seeds(self.seeds)
+        if not 0 < self.epochs_scale <= 100:
+            raise ValueError(f"epochs-scale must lie between 0 and 100, got {self.epochs_scale}.")
+        for name, most in (
+            ("source_epochs", MAX_EPOCHS),
+            ("target_epochs", MAX_EPOCHS),
+            ("devices", MAX_DEVICES),
+            ("speed_epochs", MAX_EPOCHS),
+        ):
+            value = getattr(self, name)
+            if value is not None and not 1 <= value <= most:
+                raise ValueError(
+                    f"{name.replace('_', '-')} must lie between 1 and {most}, got {value}."
+                )
+        modes = [n for n in ("rebuild", "import_runs", "measure_speed") if getattr(self, n)]
+        if len(modes) > 1:
+            first, second = (mode.replace("_", "-") for mode in modes[:2])
+            raise ValueError(f"{first} and {second} do different things; give one of them.")
+
+    @property
+    def budget(self) -> Budget:
+        return Budget(self.preset, self.epochs_scale, self.source_epochs, self.target_epochs)
+
+
+def run(options: Options) -> None:
+    """Does what the options ask for, and writes every table and figure.
+
+    Raises:
+      ValueError, OSError: one sentence each.
+    """
+    results = Results.read(options.output)
+    if options.rebuild and not any(results.rows.values()):
+        raise ValueError(f"{options.output} holds no results; run experiments or import runs.")
+    with locked(options.output):
+        if options.import_runs:
+            import_runs(options, results)
+        elif options.measure_speed:
+            measure(options, results)
+        elif not options.rebuild:
+            train(options, results)
+        write_report(results)
+    print(f"wrote {options.output / 'README.md'}")
+
+
+@contextmanager
+def locked(directory: Path) -> Any:
+    """The results, for one program at a time.
+
+    Raises:
+      ValueError: when another one writes there.
+      OSError: when nothing can be written there.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(directory / ".lock")
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(f"{directory} is in use by another run; wait for its end.") from None
+    except OSError as error:
+        raise OSError(f"cannot write to {directory} ({error.strerror}).") from None
+    try:
+        yield
+    finally:
+        lock.release()
+        (directory / ".lock").unlink(missing_ok=True)
+
+
+def train(options: Options, results: Results) -> None:
+    """Runs what is missing of the chosen parts, and keeps each part when it ends."""
+    parts = parts_of(options.experiments)
+    missing = {part: missing_seeds(part, options, results) for part in parts}
+    for part in parts:
+        needed = missing[part] | _needed_by(part, missing, options, results)
+        for seeds, source in groups(part, needed, options, results):
+            train_part(part, seeds, source, options, results)
+
+
+def missing_seeds(part: Part, options: Options, results: Results) -> set[int]:
+    """Seeds of which no finished curve is kept.
+
+    Raises:
+      ValueError: when one of another length is: it is evidence that nothing may overwrite.
+    """
+    epochs = options.budget.epochs(part)
+    kept = results.last_epochs(part.experiment, part.arm, options.preset)
+    for seed in options.seeds:
+        if kept.get(seed, epochs) != epochs:
+            raise ValueError(
+                f"{results.directory} holds {kept[seed]} epochs of {part.experiment} {part.arm}, "
+                f"preset {options.preset}, seed {seed}, not {epochs}; choose another --output or "
+                "the same epochs."
+            )
+    return set(options.seeds) - set(kept)
+
+
+def _needed_by(
+    part: Part, missing: dict[Part, set[int]], options: Options, results: Results
+) -> set[int]:
+    """Seeds whose checkpoints other parts go on from, and that are nowhere to be found."""
+    wanted: set[int] = set()
+    for other, seeds in missing.items():
+        if other.source == (part.experiment, part.arm):
+            wanted |= seeds
+    there = {seed for seeds, _ in checkpoints_of(part, options, results) for seed in seeds}
+    return wanted - there
+
+
+def groups(
+    part: Part, seeds: set[int], options: Options, results: Results
+) -> list[tuple[tuple[int, ...], Path | None]]:
+    """Seeds to train side by side, with the checkpoints that they start from.
+
+    A run that was begun goes on as it was; the others are grouped as their sources are.
+    """
+    found: list[tuple[tuple[int, ...], Path | None]] = []
+    left = set(seeds)
+    starts: list[tuple[tuple[int, ...], Path | None]] = [(tuple(sorted(left)), None)]
+    if part.source is not None:
+        source = Part(*part.source)
+        starts = [*checkpoints_of(source, options, results)]
+    for begun in _begun(part, options):
+        if left & set(begun):
+            found.append((begun, _start(begun, starts)))
+            left -= set(begun)
+    for there, path in starts:
+        if together := tuple(sorted(left & set(there))):
+            found.append((together, path))
+            left -= set(together)
+    return found
+
+
+def _start(
+    seeds: tuple[int, ...], starts: Iterable[tuple[tuple[int, ...], Path | None]]
+) -> Path | None:
+    return next((path for there, path in starts if set(seeds) <= set(there)), None)
+
+
+def _begun(part: Part, options: Options) -> list[tuple[int, ...]]:
+    """Seeds of the runs of a part, finished or not."""
+    directory = directory_of(part, options.preset, (), options.runs).parent
+    found = sorted(directory.glob("seeds-*/config.json")) if directory.is_dir() else []
+    return [seeds for file in found if (seeds := seeds_of(file.parent))]
+
+
+def checkpoints_of(
+    part: Part, options: Options, results: Results
+) -> list[tuple[tuple[int, ...], Path]]:
+    """(seeds, checkpoints) of a finished source: our own runs, then those that were imported."""
+    found = []
+    for seeds in _begun(part, options):
+        directory = directory_of(part, options.preset, seeds, options.runs)
+        if (directory / "summary.json").exists():
+            found.append((seeds, directory / "checkpoints" / SOURCE))
+    for file in sorted((results.directory / PROVENANCE).glob("*.json")):
+        known = json.loads(file.read_text())
+        path = Path(known["run"]) / "checkpoints" / SOURCE
+        name = f"{part.experiment} {part.arm}"
+        if known["preset"] == options.preset and name in known["parts"] and path.is_dir():
+            found.append((tuple(known["seeds"]), path))
+    return [pair for pair in found if checkpoint.latest(pair[1]) is not None]
+
+
+def train_part(
+    part: Part, seeds: tuple[int, ...], source: Path | None, options: Options, results: Results
+) -> None:
+    """Runs a part, or goes on with it, unless it is finished; then keeps its rows."""
+    directory = directory_of(part, options.preset, seeds, options.runs)
+    name = f"{part.experiment} {part.arm}"
+    print(f"== {name}, preset {options.preset}, seeds {' '.join(map(str, seeds))}", flush=True)
+    if not (directory / "summary.json").exists():
+        config = config_of(part, options.budget, seeds, directory, source, options.devices)
+        note = Provenance.of([name], options.preset, seeds, directory)
+        note.write(results.directory, {"command": command(), "commit": commit()})
+        try:
+            run_experiment(config)
+        except StoppedError as error:
+            # A part without an end is no curve; its file says why, and the others go on.
+            note.write(results.directory, {"stopped": str(error)})
+            print(f"{name}: {error}", flush=True)
+            return
+    results.add(FinishedRun(directory, {part.stage: (part.experiment, part.arm)}))
+    results.write()
+
+
+def import_runs(options: Options, results: Results) -> None:
+    """Keeps the finished arms of runs that were made without this program."""
+    found = [recognised(directory) for directory in options.import_runs]
+    for finished in found:
+        results.add(finished)
+        config = finished.config
+        parts = [" ".join(name) for name in finished.names.values()]
+        about = {
+            "command": shlex.join(["python", *config["command"]]),
+            "commit": options.import_commit,
+            "versions": config["versions"],
+        }
+        note = Provenance.of(
+            parts,
+            config["options"]["preset"],
+            tuple(config["options"]["seeds"]),
+            finished.directory,
+        )
+        note.write(results.directory, about)
+        print(f"kept {', '.join(parts)} of {finished.directory}")
+        if changed := changed_settings(config["options"]):
+            print(f"  with another {', '.join(changed)} than preset {config['options']['preset']}")
+    results.write()
+
+
+def measure(options: Options, results: Results) -> None:
+    """Table II for the chosen experiments, a row at a time."""
+    # Only this mode needs the learner itself.
+    from paper_speed import seconds_per_epoch
+
+    for part in parts_of(options.experiments):
+        if part.changes or part.share != 1:
+            continue
+        start = None
+        if part.source is not None:
+            sources = checkpoints_of(Part(*part.source), options, results)
+            start = sources[0][1] if sources else None
+            if start is None:
+                print(f"{part.experiment} {part.arm}: no source to start from, left out")
+                continue
+        config = config_of(part, options.budget, (0,), options.runs, start, options.devices)
+        timed = seconds_per_epoch(config, part.stage, options.speed_epochs)
+        about = {"experiment": part.experiment, "arm": part.arm, "preset": options.preset}
+        known = machine()
+        where = {"machine": f"{known['processor']}, {known['cores']} cores", "commit": commit()}
+        key = ("experiment", "arm", "preset")
+        results.replace("seconds_per_epoch", [{**about, **timed, **where}], key)
+        results.write()
+        print(f"{part.experiment} {part.arm}: {timed['seconds']:.3f} s per epoch", flush=True)
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the rows of a run come from: its file is added to each time the run goes on."""
+
+    parts: list[str]
+    preset: str
+    seeds: tuple[int, ...]
+    run: Path
+
+    @classmethod
+    def of(
+        cls, parts: list[str], preset: str, seeds: tuple[int, ...], directory: Path
+    ) -> "Provenance":
+        return cls(parts, preset, seeds, directory.resolve())
+
+    def write(self, results: Path, session: dict[str, Any]) -> None:
+        """Adds a session: its command and commit, versions, machine and time."""
+        by_experiment: dict[str, list[str]] = {}
+        for part in self.parts:
+            experiment, arm = part.split()
+            by_experiment.setdefault(experiment, []).append(arm)
+        names = "+".join(f"{name}-{'+'.join(arms)}" for name, arms in by_experiment.items())
+        seeds = "-".join(map(str, self.seeds))
+        file = results / PROVENANCE / f"{self.preset}-{names}-seeds-{seeds}.json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        before = json.loads(file.read_text())["sessions"] if file.exists() else []
+        now = {
+            "versions": versions(),
+            "machine": machine(),
+            "load_before": os.getloadavg()[0],
+            "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            **session,
+        }
+        write_json(
+            file,
+            {
+                "parts": self.parts,
+                "preset": self.preset,
+                "seeds": self.seeds,
+                "run": self.run,
+                "sessions": [*before, now],
+            },
+        )
+
+
+def command() -> str:
+    """As it can be typed again."""
+    return shlex.join(["python", *sys.argv])
+
+
+def main() -> None:
+    """Reads the options and runs."""
+    with plain_errors():
+        options = parse(Options, Options())
+        devices = options.devices or min(os.cpu_count() or 1, MAX_DEVICES)
+        if not options.rebuild and not options.import_runs:
+            prepare_jax(devices)
+        run(options)
+
+
+if __name__ == "__main__":
+    main()
