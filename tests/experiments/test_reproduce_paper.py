@@ -1,6 +1,5 @@
 """The paper's reproduction: statistics by hand, tables and figures from kept files, going on."""
 
-import csv
 import json
 import shutil
 import sys
@@ -399,40 +398,31 @@ def test_the_kept_results_are_what_their_files_say(tmp_path):
             assert after[name].read_text() == before[name].read_text(), name
 
 
-class Stopped(Exception):
-    """Stands for whatever ends a program in its middle."""
+@pytest.mark.slow
+def test_a_part_that_was_stopped_goes_on_and_its_rows_are_kept(tiny, monkeypatch):
+    parts = [Part("pp-ic3net", "source"), Part("pp-ic3net", "transfer", "source")]
+    monkeypatch.setattr(reproduce_paper, "parts_of", lambda selections: parts)
+    record = transfer_run.Recorder._record
 
+    def stop_in_the_transfer(self, stage, chunk):
+        record(self, stage, chunk)
+        if stage.arm == "transfer":
+            raise KeyboardInterrupt  # its rows are written, its checkpoint is not
 
-def test_a_stopped_reproduction_goes_on_and_finished_parts_are_not_run_again(tiny, monkeypatch):
-    trained = []
-    whole = transfer_run.run_experiment
-
-    def count(config):
-        trained.append(config.directory.parent.name)
-        if trained == ["source", "transfer"]:
-            raise Stopped
-        return whole(config)
-
-    monkeypatch.setattr(reproduce_paper, "run_experiment", count)
-    with pytest.raises(Stopped):
+    monkeypatch.setattr(transfer_run.Recorder, "_record", stop_in_the_transfer)
+    with pytest.raises(KeyboardInterrupt):
         run(tiny)
     assert [row["arm"] for row in Results.read(tiny.output).rows["curves"]] == ["source"]
+    monkeypatch.setattr(transfer_run.Recorder, "_record", record)
     run(tiny)
-    assert trained == ["source", "transfer", "transfer", "scratch"]
-    run(tiny)
-    assert len(trained) == 4
-    rows = list(csv.DictReader((tiny.output / "curves.csv").read_text().splitlines()))
-    assert [(r["arm"], r["seed"], r["epoch"]) for r in rows] == [
-        (arm, "0", "1") for arm in ("scratch", "source", "transfer")
-    ]
+    kept = Results.read(tiny.output)
+    rows = [(row["arm"], row["seed"], row["epoch"]) for row in kept.rows["curves"]]
+    assert rows == [("source", 0, 1), ("transfer", 0, 1)]
+    assert {row["arm"] for row in kept.rows["evaluations"]} == {"source", "transfer", "zero-shot"}
     (file,) = (tiny.output / "provenance").glob("fast-pp-ic3net-transfer-*.json")
     said_of = json.loads(file.read_text())
     assert len(said_of["sessions"]) == 2
     assert {"command", "commit", "versions", "machine"} <= set(said_of["sessions"][0])
-    evaluations = Results.read(tiny.output).rows["evaluations"]
-    assert {row["arm"] for row in evaluations} == {"source", "transfer", "zero-shot", "scratch"}
-    with pytest.raises(ValueError, match=r"holds 1 epochs of pp-ic3net source, .* not 2; choose"):
-        run(replace(tiny, source_epochs=2))
 
 
 def test_seeds_that_are_added_are_run_alone_beside_what_was_begun(tiny, tmp_path):
