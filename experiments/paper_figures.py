@@ -84,7 +84,8 @@ def figure_2(
     figure = Figure(figsize=(13.0, 14.5), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     seeds: set[int] = set()
-    for panel, part in zip(PANELS, figure.subfigures(len(PANELS), 1), strict=True):
+    parts: Any = figure.subfigures(len(PANELS), 1)
+    for panel, part in zip(PANELS, parts, strict=True):
         line = part.subplots(1, len(AXES), sharey=True)
         curves = _curves(rows, panel, preset)
         seeds |= {len(arm.steps_taken) for arm, _ in curves.values()}
