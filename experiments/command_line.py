@@ -15,7 +15,8 @@ from typing import Any, TypeVar, get_type_hints
 import jax
 import tyro
 from config_file import NOTE, with_config_file
-from transfer_run import TransferConfig, run_experiment
+from transfer_config import TransferConfig
+from transfer_run import run_experiment
 
 from sumajax import hosts
 from sumajax.learning import parallel, preset

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from published import EXPERIMENTS
-from transfer_run import SCRATCH, SOURCE, TRANSFER
+from transfer_config import SCRATCH, SOURCE, TRANSFER
 
 from sumajax.learning import preset
 from sumajax.reporting import metrics as metrics_file

@@ -7,7 +7,8 @@ from statistics import mean, stdev
 from typing import Any
 
 import jax
-from transfer_run import SOURCE, Run, TransferConfig
+from transfer_config import SOURCE, TransferConfig
+from transfer_run import Run
 
 from sumajax.learning import parallel
 from sumajax.transfer import fresh_states, transferred_states

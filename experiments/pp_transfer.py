@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from command_line import main
-from transfer_run import TransferConfig
+from transfer_config import TransferConfig
 
 from sumajax.environments import PredatorPrey
 

@@ -41,7 +41,9 @@ from paper_results import (
     machine,
     recognised,
 )
-from transfer_run import MAX_DEVICES, MAX_EPOCHS, SOURCE, check_seeds, run_experiment, versions
+from run_directory import versions
+from transfer_config import MAX_DEVICES, MAX_EPOCHS, SOURCE, check_seeds
+from transfer_run import run_experiment
 
 from sumajax import checkpoint
 from sumajax.reporting import write_json
@@ -131,7 +133,7 @@ def run(options: Options) -> None:
             measure(options, results)
         elif not options.rebuild:
             train(options, results)
-        write_report(results)
+        write_report(Results.read(options.output))  # of the numbers that are kept, no finer ones
     print(f"wrote {options.output / 'README.md'}")
 
 

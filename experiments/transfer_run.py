@@ -3,36 +3,28 @@
 Shared by `pp_transfer.py` and `pcp_transfer.py`; everything that computes is in the package.
 """
 
-import csv
-import io
-import json
-import os
-import platform
-import re
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
+import evaluations_file
 import jax
 import numpy as np
-from filelock import FileLock, Timeout
 from interrupt import stop_when_asked
 from jax.sharding import Mesh
+from run_directory import claimed, described, plain
+from transfer_config import SCRATCH, SOURCE, TRANSFER, TransferConfig
 
 from sumajax import checkpoint, hosts, reporting
-from sumajax.environments import PredatorCapturePrey
 from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES, evaluate, evaluate_random, shortest_path_steps
-from sumajax.learning import EPOCH_STEPS, LearnerConfig, TrainState, make_learner, parallel
+from sumajax.learning import EPOCH_STEPS, TrainState, make_learner, parallel
 from sumajax.policies import Policy, make_policy
-from sumajax.policies.encoder import EncoderKind
 from sumajax.reporting import metrics as metrics_file
-from sumajax.reporting.loggers import LoggerName, Loggers, check_installed
+from sumajax.reporting.loggers import Loggers, check_installed
 from sumajax.transfer import (
     Chunk,
     Stage,
@@ -43,126 +35,10 @@ from sumajax.transfer import (
     transferred_states,
     untrained_parameters,
 )
-from sumajax.upsampling import Fill, Scale, StateUpsampled
+from sumajax.upsampling import Fill, StateUpsampled
 
-Upsampling = Literal["blocks", "corner", "none"]
-SOURCE, TRANSFER, SCRATCH = "source", "transfer", "scratch"
-MAX_EPOCHS = 100_000
-"""Updates are counted in 32 bits, and an epoch has at most 20,000."""
-MAX_DEVICES = 256
-MAX_HOSTS = 256
-WHERE = ("devices", "hosts", "host", "coordinator")
-"""Options that say where a run is computed: they change no result, and may change between runs."""
 EVALUATION_SEED = 7
 """Of the policy's own randomness in held-out episodes; the starts are fixed in the package."""
-
-
-@dataclass(frozen=True)
-class TransferConfig:
-    """Options of a transfer experiment; an experiment adds its name and default tasks."""
-
-    experiment: ClassVar[str]
-
-    source: PredatorCapturePrey
-    """The small task, whose state is upsampled to the target's size."""
-    target: PredatorCapturePrey
-    """The large task."""
-    policy: str = "ic3net"
-    """ic3net, commnet, iric, ic, magic, hetnet or hetnet-binary."""
-    preset: Literal["fast", "paper"] = "fast"
-    """fast: this package's learner. paper: the originals' procedure."""
-    seeds: tuple[int, ...] = (0,)
-    """Each trains its own policy; all are reported."""
-    source_epochs: int = 50
-    """Epochs of 20,000 environment steps on the source task."""
-    target_epochs: int = 125
-    """Epochs on the target task, for each of the two arms; 0 stops after the source."""
-    scratch: bool = True
-    """Also train on the target from scratch, with the same budget."""
-    source_checkpoint: Path | None = None
-    """Checkpoints to transfer from, made elsewhere; the source stage is then left out."""
-    output: Path | None = None
-    """Directory of the run; runs/<experiment>-<policy>-<preset> if not given."""
-    scale: Scale = "none"
-    """What upsampling does to the state's mass: none (the paper), or mass (blocks sum to one)."""
-    upsampling: Upsampling = "blocks"
-    """blocks: the paper's. corner: the small state as it is, zeros around it. none: the small state
-    alone, which only the encoder lab_gap can take to another grid."""
-    encoder: EncoderKind = "flat"
-    """How the policy reads the state: flat, lab_gap (pools over the grid) or linear."""
-    carry_optimiser: bool = False
-    """Carry the optimiser's memory over with the parameters."""
-    leave_out: tuple[str, ...] = ()
-    """Modules of the policy whose parameters are not carried over, as state_encoder."""
-    evaluate_every: int = 15
-    """Epochs between held-out evaluations while a target arm trains; 0 for none."""
-    threshold: float = 20.0
-    """Steps taken that count as solved in the comparison."""
-    devices: int | None = None
-    """CPU devices to spread seeds and environments over, of each host; None: all that they spread
-    over."""
-    hosts: int = 1
-    """How many machines (or processes) train together, each started with the same command and its
-    own --host."""
-    host: int = 0
-    """Which of them this one is; 0 has the files and the screen."""
-    coordinator: str | None = None
-    """HOST:PORT of host 0, with several hosts."""
-    log: tuple[LoggerName, ...] = ()
-    """Where to show the metrics beside metrics.csv: tensorboard, wandb."""
-    learner: LearnerConfig = field(default_factory=LearnerConfig)
-    """The learner's settings; what is not given comes from the preset."""
-
-    def __post_init__(self) -> None:
-        for name, least, most in (
-            ("source_epochs", 1, MAX_EPOCHS),
-            ("target_epochs", 0, MAX_EPOCHS),
-            ("evaluate_every", 0, MAX_EPOCHS),
-            ("hosts", 1, MAX_HOSTS),
-            ("host", 0, self.hosts - 1),
-            ("num_devices", 1, MAX_DEVICES),
-        ):
-            if not least <= getattr(self, name) <= most:
-                raise ValueError(
-                    f"{name.removeprefix('num_').replace('_', '-')} must lie between {least} and "
-                    f"{most}, got {getattr(self, name)}."
-                )
-        check_seeds(self.seeds)
-        if not 0 < self.threshold < float("inf"):
-            raise ValueError(f"threshold must be a number greater than 0, got {self.threshold}.")
-        if self.source_checkpoint is not None and not self.target_epochs:
-            raise ValueError(
-                "source-checkpoint leaves the source stage out and target-epochs 0 the target; "
-                "give target-epochs of at least 1."
-            )
-        if (self.coordinator is None) != (self.hosts == 1):
-            raise ValueError(
-                f"hosts {self.hosts} and coordinator {self.coordinator} do not go together; "
-                "several hosts need the HOST:PORT of host 0, one needs none."
-            )
-        if self.coordinator is not None:
-            hosts.address(self.coordinator)
-        parallel.spread(len(self.seeds), self.learner.num_envs, self.hosts * self.num_devices)
-
-    @property
-    def num_devices(self) -> int:
-        """Of this host: those asked for, or as many as seeds and environments spread over."""
-        if self.devices is not None:
-            return self.devices
-        most = min(os.cpu_count() or 1, MAX_DEVICES)
-        return parallel.most_devices(len(self.seeds), self.learner.num_envs, most, self.hosts)
-
-    @property
-    def directory(self) -> Path:
-        return self.output or Path("runs") / f"{self.experiment}-{self.policy}-{self.preset}"
-
-
-def check_seeds(seeds: tuple[int, ...]) -> None:
-    """Refuses none, doubles and what does not fit into 31 bits."""
-    if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= s < 2**31 for s in seeds):
-        raise ValueError(
-            f"seeds must be distinct numbers from 0 to {2**31 - 1}, got {list(seeds)}."
-        )
 
 
 @dataclass(frozen=True)
@@ -225,88 +101,6 @@ class Run:
         )
 
 
-@contextmanager
-def claimed(config: TransferConfig) -> Iterator[Path]:
-    """The run's directory, made or gone on with, and locked against a second run.
-
-    Raises:
-      ValueError: when it holds something else, a finished run, or one with other options.
-      OSError: when it cannot be written.
-    """
-    directory = config.directory
-    described = _described(config)
-    missing: list[Path] = []
-    try:
-        _check_directory(directory, described)  # before anything is written there
-        missing = [path for path in (directory, *directory.parents) if not os.path.lexists(path)]
-        directory.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(directory / ".lock")
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise ValueError(
-            f"{directory} is in use by another run; choose another --output."
-        ) from None
-    except OSError as error:
-        for path in missing:
-            with suppress(OSError):
-                path.rmdir()
-        raise OSError(
-            f"cannot write to {directory} ({error.strerror}); choose another --output."
-        ) from None
-    try:
-        _check_directory(directory, described)
-        for path in directory.iterdir():
-            if _LEFTOVER.fullmatch(path.name):
-                path.unlink()
-        reporting.write_json(
-            directory / "config.json",
-            {"command": sys.argv, "options": described, "versions": versions()},
-        )
-        yield directory
-    finally:
-        lock.release()
-
-
-def _described(config: TransferConfig) -> dict[str, Any]:
-    """The options as config.json keeps them, without those of one host's place in the run."""
-    options = {**asdict(config), "devices": config.num_devices}
-    return _plain({name: options[name] for name in options if name not in WHERE[1:]})
-
-
-_LEFTOVER = re.compile(r"\..+\.\d+\.tmp")
-"""What a writer that was killed leaves of a file."""
-
-
-def _check_directory(directory: Path, described: dict[str, Any]) -> None:
-    file = directory / "config.json"
-    if not file.exists():
-        is_there = directory.is_dir()
-        others = sorted(path.name for path in directory.iterdir()) if is_there else []
-        others = [name for name in others if name != ".lock" and not _LEFTOVER.fullmatch(name)]
-        if others:
-            raise ValueError(
-                f"{directory} exists and holds {others[0]!r}, not a run; choose another --output."
-            )
-        return
-    try:
-        before = dict(json.loads(file.read_text())["options"])
-    except (ValueError, KeyError, TypeError):
-        raise ValueError(f"{file} is not readable; choose another --output.") from None
-    changed = [
-        name
-        for name in described
-        if name not in WHERE and described[name] != before.get(name, described[name])
-    ]
-    if changed:
-        name = changed[0]
-        raise ValueError(
-            f"{directory} holds a run with {name} {before[name]}, not {described[name]}; "
-            "choose another --output, or the same options to go on with it."
-        )
-    if (directory / "summary.json").exists():
-        raise ValueError(f"{directory} holds a finished run; choose another --output or remove it.")
-
-
 class Recorder:
     """Runs the stages of an experiment and keeps its files up to date."""
 
@@ -329,7 +123,7 @@ class Recorder:
         stage = self.run.stage(arm)
         done = saved_epoch(stage)
         metrics_file.truncate_after(self.metrics, arm, done)
-        _truncate_evaluations(self.evaluations, arm, done)
+        evaluations_file.truncate_after(self.evaluations, arm, done)
         self._cost[arm] = _cost_so_far(self.metrics, stage)
         self.loggers.resume(arm, int(np.max(self._cost[arm][0])))
         self.progress.begin(arm, done)
@@ -425,7 +219,9 @@ class Recorder:
             held_out = _evaluation(
                 stage.learner.env, stage.learner.policy, chunk.states.params, greedy=False
             )
-            _append_evaluation(self.evaluations, stage, chunk.epoch, env_steps[:, -1], held_out)
+            evaluations_file.append(
+                self.evaluations, stage, chunk.epoch, env_steps[:, -1], held_out
+            )
         latest = {
             "steps_taken": _mean(chunk.metrics.steps_taken[:, -1]),
             "success": _mean(chunk.metrics.success[:, -1]),
@@ -516,47 +312,6 @@ def _cost_so_far(metrics: Path, stage: Stage) -> tuple[np.ndarray, float]:
     return np.array(env_steps, int), last[stage.seeds[0]]["seconds"] if last else 0.0
 
 
-EVALUATION_COLUMNS = ("arm", "seed", "epoch", "env_steps", "steps_taken", "success", "return")
-"""Of evaluations.csv: sampled actions on the held-out starts while a target arm trains."""
-
-
-def _append_evaluation(
-    file: Path, stage: Stage, epoch: int, env_steps: np.ndarray, held_out: dict[str, Any]
-) -> None:
-    rows = _read_evaluations(file)
-    for index, seed in enumerate(stage.seeds):
-        figures = [held_out[name][index] for name in EVALUATION_COLUMNS[4:]]
-        rows.append([stage.arm, seed, epoch, int(env_steps[index]), *figures])
-    _write_evaluations(file, rows)
-
-
-def _truncate_evaluations(file: Path, arm: str, epoch: int) -> None:
-    rows = _read_evaluations(file)
-    kept = [row for row in rows if row[0] != arm or int(row[2]) <= epoch]
-    if len(kept) < len(rows):
-        _write_evaluations(file, kept)
-
-
-def _read_evaluations(file: Path) -> list[list[Any]]:
-    return list(csv.reader(file.read_text().splitlines()))[1:] if file.exists() else []
-
-
-def _write_evaluations(file: Path, rows: list[list[Any]]) -> None:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([EVALUATION_COLUMNS, *rows])
-    reporting.write_text(file, text.getvalue())
-
-
-def _plain(value: Any) -> Any:
-    """`value` as JSON would read it back."""
-    return json.loads(json.dumps(value, default=str))
-
-
-def versions() -> dict[str, str]:
-    packages = ("sumajax", "jax", "flax", "optax", "orbax-checkpoint", "numpy")
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}
-
-
 def run_experiment(config: TransferConfig) -> dict[str, Any]:
     """Runs, or goes on with, the whole experiment; prints its table and returns its summary.
 
@@ -576,7 +331,7 @@ def run_experiment(config: TransferConfig) -> dict[str, Any]:
 def _check_hosts(config: TransferConfig) -> None:
     """Refuses hosts that were started differently: each would wait for what the others never do."""
     options = hosts.everyone_says(
-        {**_described(config), "devices of each host": jax.local_device_count()}
+        {**described(config), "devices of each host": jax.local_device_count()}
     )
     for host, other in enumerate(options):
         for name, value in options[0].items():
@@ -614,7 +369,7 @@ def _lead(run: Run, arms: list[str]) -> dict[str, Any]:
     with (
         claimed(config) as directory,
         reporting.Progress(epochs) as progress,
-        Loggers(config.log, directory, _plain(asdict(config))) as loggers,
+        Loggers(config.log, directory, plain(asdict(config))) as loggers,
     ):
         recorder = Recorder(run, directory, progress, loggers)
         source = config.source_checkpoint or run.checkpoints(SOURCE)

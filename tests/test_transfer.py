@@ -233,9 +233,7 @@ class TestUntrainedParameters:
         assert untrained_parameters(stage.directory, result.states.params) == []
 
     @pytest.mark.slow  # compiles HetNet's learner
-    def test_what_passes_between_capture_agents_waits_for_a_second_one(
-        self, tmp_path, monkeypatch
-    ):
+    def test_what_passes_between_capture_agents_waits_for_a_second_one(self, tmp_path, monkeypatch):
         monkeypatch.setattr(config, "EPOCH_STEPS", 2_000)  # one update is enough
         env = StateUpsampled(PredatorCapturePrey(3, 2, 1, max_steps=10), 6)
         policy = make_policy("hetnet", env)

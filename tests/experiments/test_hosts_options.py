@@ -5,7 +5,7 @@ import os
 
 import pytest
 from pp_transfer import PPTransfer
-from transfer_run import claimed
+from run_directory import claimed
 
 HERE = "127.0.0.1:1234"
 

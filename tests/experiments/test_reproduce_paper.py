@@ -3,7 +3,7 @@
 import json
 import shutil
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from math import inf, nan
 
@@ -29,6 +29,7 @@ from paper_statistics import (
 )
 from published import EXPERIMENTS, SOURCES
 from reproduce_paper import Options, run
+from run_directory import plain
 
 from sumajax import checkpoint, evaluate
 from sumajax.environments import PredatorPrey
@@ -439,7 +440,7 @@ def test_runs_of_the_transfer_programs_are_imported(tmp_path, monkeypatch):
     directory = tmp_path / "run"
     directory.mkdir()
     config = config_of(Part("pp-ic3net", "source"), Budget("fast"), (0,), directory, None, 1)
-    options = transfer_run._plain(transfer_run.asdict(replace(config, target_epochs=1)))
+    options = plain(asdict(replace(config, target_epochs=1)))
     options |= {"source_epochs": 1}
     (directory / "config.json").write_text(
         json.dumps({"command": ["x"], "versions": {}, "options": options})

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import transfer_run
 from pp_transfer import PPTransfer
+from run_directory import claimed
 
 from sumajax import evaluate, load_agent
 from sumajax.environments import PredatorPrey
@@ -170,5 +171,5 @@ def test_a_source_alone(toy, tmp_path):
 
 def test_a_second_run_in_the_same_directory_is_refused(toy, tmp_path):
     config = replace(toy, output=tmp_path / "busy")
-    with transfer_run.claimed(config), pytest.raises(ValueError, match="in use by another run"):
+    with claimed(config), pytest.raises(ValueError, match="in use by another run"):
         transfer_run.run_experiment(config)
