@@ -85,8 +85,12 @@ def test_action_by_a_state_too_large_to_list():
 
 @pytest.mark.parametrize("policy", ["commnet", "ic3net"])
 def test_message(policy):
-    """Agent 1 acts on what only agent 0 saw; with IC3Net both must have opened their gates."""
-    (played,) = learn(Tell(max_steps=2), policy=policy, epochs=5, **SMALL)
+    """Agent 1 acts on what only agent 0 saw; with IC3Net both must have opened their gates.
+
+    At the other probes' rate one seed in three closes them before there is anything to hear.
+    """
+    settings = {**SMALL, "learning_rate": 3e-3}
+    (played,) = learn(Tell(max_steps=2), policy=policy, epochs=5, **settings)
     assert (earned(played) > ALWAYS).all()
 
 
