@@ -38,9 +38,9 @@ class TransferConfig:
     """fast: this package's learner. paper: the originals' procedure."""
     seeds: tuple[int, ...] = (0,)
     """Each trains its own policy; all are reported."""
-    source_epochs: int = 50
+    source_epochs: int = 40
     """Epochs of 20,000 environment steps on the source task."""
-    target_epochs: int = 125
+    target_epochs: int = 100
     """Epochs on the target task, for each of the two arms; 0 stops after the source."""
     scratch: bool = True
     """Also train on the target from scratch, with the same budget."""
