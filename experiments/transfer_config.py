@@ -40,7 +40,7 @@ class TransferConfig:
     """Each trains its own policy; all are reported."""
     source_epochs: int = 40
     """Epochs of 20,000 environment steps on the source task."""
-    target_epochs: int = 100
+    target_epochs: int = 80
     """Epochs on the target task, for each of the two arms; 0 stops after the source."""
     scratch: bool = True
     """Also train on the target from scratch, with the same budget."""
