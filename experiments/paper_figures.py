@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from paper_statistics import Arm, Row, arm_of
 from published import EXPERIMENTS
 
-from sumajax.reporting.curves import FAINT, INK, spread, write_png
+from sumajax.reporting.curves import FAINT, INK, dress, spread, write_png
 
 # Okabe and Ito's palette, as in the package's own curves; an experiment keeps its colour.
 COLOURS = {
@@ -169,19 +169,12 @@ def _draw_levels(axes: Axes, levels: Mapping[str, list[float]], named: bool) -> 
 
 
 def _dress(axes: Axes, label: str, empty: bool) -> None:
-    axes.set_xlabel(label, color=INK)
-    axes.set_xlim(left=0)
+    dress(axes, label)
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-    axes.grid(True, color="#E6E6E6", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(FAINT)
-    axes.tick_params(colors=INK, labelsize=9)
     if empty:
         axes.text(0.5, 0.5, "not run yet", transform=axes.transAxes, ha="center", color=FAINT)
 

@@ -6,6 +6,7 @@ reads them from the paper's text.
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 
@@ -85,13 +86,14 @@ _PP_TARGET = PredatorPrey(size=10, num_predators=5, vision=1, max_steps=200)
 _PCP_SOURCE = PredatorCapturePrey(size=5, num_predators=2, num_capturers=1, max_steps=80)
 _PCP_SOURCE_SECONDS = {"source_plain": (490.64, 2.46), "source": (315.05, 0.87)}
 
+_predator_prey = partial(Experiment, source=_PP_SOURCE, target=_PP_TARGET)
+_capture = partial(Experiment, policy="hetnet", source=_PCP_SOURCE, source_of="pcp-hetnet-2p1c")
+
 _ROWS = (
-    Experiment(
+    _predator_prey(
         name="pp-ic3net",
         title="PP, IC3Net, 10x10 5P",
         policy="ic3net",
-        source=_PP_SOURCE,
-        target=_PP_TARGET,
         hours=10.0,
         scratch=55.59,
         transfer=20.72,
@@ -104,12 +106,10 @@ _ROWS = (
         ),
         source_of="pp-ic3net",
     ),
-    Experiment(
+    _predator_prey(
         name="pp-magic",
         title="PP, MAGIC, 10x10 5P",
         policy="magic",
-        source=_PP_SOURCE,
-        target=_PP_TARGET,
         hours=30.0,
         scratch=192.61,
         transfer=69.67,
@@ -122,12 +122,10 @@ _ROWS = (
         ),
         source_of="pp-magic",
     ),
-    Experiment(
+    _predator_prey(
         name="pp-hetnet",
         title="PP, HetNet, 10x10 5P",
         policy="hetnet",
-        source=_PP_SOURCE,
-        target=_PP_TARGET,
         hours=100.0,
         scratch=189.70,
         transfer=27.13,
@@ -140,31 +138,25 @@ _ROWS = (
         ),
         source_of="pp-hetnet",
     ),
-    Experiment(
+    _capture(
         name="pcp-hetnet-2p1c",
         title="PCP, HetNet, 10x10 2P/1C",
-        policy="hetnet",
-        source=_PCP_SOURCE,
         target=PredatorCapturePrey(size=10, num_predators=2, num_capturers=1, max_steps=200),
         hours=200.0,
         scratch=184.62,
         transfer=30.19,
         pretraining=700,
         seconds=_seconds(**_PCP_SOURCE_SECONDS, scratch=(784.00, 5.45), transfer=(791.37, 5.05)),
-        source_of="pcp-hetnet-2p1c",
     ),
-    Experiment(
+    _capture(
         name="pcp-hetnet-3p2c",
         title="PCP, HetNet, 10x10 3P/2C",
-        policy="hetnet",
-        source=_PCP_SOURCE,
         target=PredatorCapturePrey(size=10, num_predators=3, num_capturers=2, max_steps=200),
         hours=350.0,
         scratch=199.85,
         transfer=25.34,
         pretraining=700,
         seconds=_seconds(**_PCP_SOURCE_SECONDS, scratch=(835.35, 7.57), transfer=(846.94, 3.44)),
-        source_of="pcp-hetnet-2p1c",
     ),
 )
 

@@ -1,8 +1,9 @@
 """From an empty grid to a team that was trained, carried to a larger grid and can be watched.
 
 Run it whole, `python experiments/tutorial.py`, or cell by cell in an editor that knows `# %%`
-(Jupyter, VS Code). Each run writes to a directory of its own under `runs/`. What a cell prints
-stands below it, as it came out once; on another machine the last digits differ.
+(Jupyter, VS Code). It takes some two minutes on two CPU cores, and each run writes to a directory
+of its own under `runs/`. What a cell prints stands below it, as it came out once; on another
+machine the last digits differ.
 """
 
 # %% [markdown]
@@ -35,7 +36,10 @@ print("predators at", state.agents.tolist(), "prey at", state.prey.tolist())
 
 stay = jnp.full(3, 4)  # 0 up, 1 right, 2 down, 3 left, 4 stay
 state, transition = small.step(state, stay)
-print("reward of a step:", transition.reward.tolist())
+print("reward of a step:", [round(r, 2) for r in transition.reward.tolist()])
+
+# predators at [[4, 3], [4, 4], [1, 4]] prey at [2, 3]
+# reward of a step: [-0.05, -0.05, -0.05]      (each step costs an agent that has not arrived)
 
 # %% [markdown]
 # ## 2. Upsampling changes one tensor
@@ -50,6 +54,12 @@ target = PredatorPrey(size=10, num_predators=5, vision=1, max_steps=200)
 print("native", small.observe(state).state.shape, "upsampled", source.observe(state).state.shape)
 print(source.observe(state).state[0, 0].astype(int))
 
+# native (3, 1, 5, 5) upsampled (3, 1, 10, 10)
+# [[0 0 0 0 0 0 0 0 0 0]                       (the first predator's cell: row 4, column 3)
+#  ..
+#  [0 0 0 0 0 0 1 1 0 0]
+#  [0 0 0 0 0 0 1 1 0 0]]
+
 # %% [markdown]
 # ## 3. Train on the small task
 #
@@ -62,7 +72,7 @@ rows: list[dict] = []
 
 
 def stage_of(arm: str, env: Environment) -> Stage:
-    """IC3Net on `env` with the preset `fast`, annealed over this short stage."""
+    """IC3Net on `env` with the settings of the preset `fast`."""
     learner = make_learner(env, make_policy("ic3net", env))
     return Stage(arm, learner, EPOCHS, seeds=(0,), directory=OUTPUT / "checkpoints" / arm)
 
@@ -83,6 +93,10 @@ def follow(stage: Stage) -> Callable[[Chunk], None]:
 source_stage = stage_of("source", source)
 run_stage(source_stage, lambda: fresh_states(source_stage), on_chunk=follow(source_stage))
 
+# source   epoch  5:  24.8 steps, success 0.94, 4 s
+# source   epoch 10:   6.7 steps, success 1.00, 5 s
+# source   epoch 15:   6.2 steps, success 1.00, 5 s
+
 # %% [markdown]
 # ## 4. Carry it over, and train from scratch beside it
 #
@@ -95,6 +109,13 @@ start = transferred_states(transfer_stage, source_stage.directory)
 untrained = jax.tree.map(lambda leaf: leaf[0], start.params)  # seed 0, before any training there
 run_stage(transfer_stage, lambda: start, on_chunk=follow(transfer_stage))
 run_stage(scratch_stage, lambda: fresh_states(scratch_stage), on_chunk=follow(scratch_stage))
+
+# transfer epoch  5: 128.8 steps, success 0.58, 7 s     (worse than untrained, at first)
+# transfer epoch 10:  27.8 steps, success 0.99, 7 s
+# transfer epoch 15:  18.4 steps, success 1.00, 7 s
+# scratch  epoch  5: 198.1 steps, success 0.04, 7 s
+# scratch  epoch 10: 175.5 steps, success 0.30, 7 s
+# scratch  epoch 15: 157.0 steps, success 0.47, 7 s
 
 # %% [markdown]
 # ## 5. Judge it on held-out starts
@@ -118,6 +139,12 @@ bound = shortest_path_steps(target)
 assert bound is not None  # a task need not offer one; these do
 print(f"{'shortest':13}{bound.mean():7.1f} steps")
 
+# zero shot      100.6 steps, success 0.612
+# transferred     18.5 steps, success 1.000
+# from scratch   146.9 steps, success 0.421
+# random         198.9 steps, success 0.021
+# shortest        10.5 steps
+
 # %% [markdown]
 # ## 6. Look at it
 #
@@ -130,6 +157,8 @@ write_gif(episode, OUTPUT / "replay.gif")
 write_strip(episode, OUTPUT / "replay.png")
 print(f"an episode of {episode.num_steps} steps is in {OUTPUT / 'replay.gif'}")
 
+# an episode of 27 steps is in runs/tutorial-20261122-120103/replay.gif
+
 # %% [markdown]
 # ## 7. Let it act in a program of your own
 #
@@ -141,3 +170,5 @@ carry, action = jax.jit(agent.act)(
     agent.initial_carry((8,)), jax.vmap(target.observe)(states), jax.random.key(2)
 )
 print("actions of 8 teams of 5:", action.shape)
+
+# actions of 8 teams of 5: (8, 5)

@@ -227,16 +227,10 @@ def run_stage(
     mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
     about: dict[str, Any] = {"arm": stage.arm, "seeds": list(stage.seeds), **(meta or {})}
     description = checkpoint.describe(stage.learner.env, stage.learner.policy, **about)
-    (is_new, first_epoch, stopped), whole = hosts.first_makes(
-        lambda: _resumed(stage, start), lambda: jax.eval_shape(lambda: fresh_states(stage))
-    )
-    stops = tuple(Stop(**stop) for stop in stopped)
+    first_epoch, stops, whole = _begin(stage, start, description)
     if first_epoch:
         on_resume(first_epoch)
     states = parallel.place(whole, mesh)
-    whole = whole if hosts.several() else states
-    if is_new:
-        hosts.first_does(partial(_save, stage, whole, {**description, "epoch": 0}))
     compile_seconds = train_seconds = 0.0
     chunks = _chunks(stage, mesh, states, first_epoch, chunk)
     while len(stops) < num_seeds and (news := next(chunks, None)) is not None:
@@ -256,6 +250,21 @@ def run_stage(
             "max_grad_norm in another directory."
         )
     return StageResult(whole, first_epoch, compile_seconds, train_seconds, stops)
+
+
+def _begin(
+    stage: Stage, start: Callable[[], TrainState], description: dict[str, Any]
+) -> tuple[int, tuple[Stop, ...], TrainState]:
+    """The epoch that the stage goes on from, which seeds had stopped, and its states.
+
+    A new stage is saved before its first epoch.
+    """
+    (is_new, first_epoch, stopped), states = hosts.first_makes(
+        lambda: _resumed(stage, start), lambda: jax.eval_shape(lambda: fresh_states(stage))
+    )
+    if is_new:
+        hosts.first_does(partial(_save, stage, states, {**description, "epoch": 0}))
+    return first_epoch, tuple(Stop(**stop) for stop in stopped), states
 
 
 def _save(

@@ -50,10 +50,9 @@ class Dense(nn.Module):
     @nn.compact
     def weights(self, in_features: int) -> tuple[chex.Array, chex.Array | None]:
         """kernel (in_features, features) and bias (features,)."""
-        init = uniform_fan_in(self.fan_in or in_features)
-        bias_init: Initializer = init
-        if self.before_relu:
-            init, bias_init = uniform_fan_in((self.fan_in or in_features) / HE_GAIN**2), zeros
+        fan_in = self.fan_in or in_features
+        init = uniform_fan_in(fan_in / HE_GAIN**2 if self.before_relu else fan_in)
+        bias_init = zeros if self.before_relu else init
         kernel = self.param("kernel", init, (in_features, self.features))
         return kernel, self.param("bias", bias_init, (self.features,)) if self.use_bias else None
 

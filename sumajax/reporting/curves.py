@@ -182,6 +182,11 @@ def _draw_panel(axes: Axes, curves: Mapping[str, Curve], x: str, names: Mapping[
             markersize=4,
             label=names[arm],
         )
+    dress(axes, label)
+
+
+def dress(axes: Axes, label: str) -> None:
+    """The look of every panel with curves: `label` under an axis from 0, a faint grid, no box."""
     axes.set_xlabel(label, color=INK)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))

@@ -30,6 +30,7 @@ from paper_statistics import (
 from published import EXPERIMENTS, SOURCES
 from reproduce_paper import Options, run
 from run_directory import plain
+from stopping import stopped_in
 
 from sumajax import checkpoint, evaluate
 from sumajax.environments import PredatorPrey
@@ -403,18 +404,9 @@ def test_the_kept_results_are_what_their_files_say(tmp_path):
 def test_a_part_that_was_stopped_goes_on_and_its_rows_are_kept(tiny, monkeypatch):
     parts = [Part("pp-ic3net", "source"), Part("pp-ic3net", "transfer", "source")]
     monkeypatch.setattr(reproduce_paper, "parts_of", lambda selections: parts)
-    record = transfer_run.Recorder._record
-
-    def stop_in_the_transfer(self, stage, chunk):
-        record(self, stage, chunk)
-        if stage.arm == "transfer":
-            raise KeyboardInterrupt  # its rows are written, its checkpoint is not
-
-    monkeypatch.setattr(transfer_run.Recorder, "_record", stop_in_the_transfer)
-    with pytest.raises(KeyboardInterrupt):
+    with stopped_in("transfer", KeyboardInterrupt):
         run(tiny)
     assert [row["arm"] for row in Results.read(tiny.output).rows["curves"]] == ["source"]
-    monkeypatch.setattr(transfer_run.Recorder, "_record", record)
     run(tiny)
     kept = Results.read(tiny.output)
     rows = [(row["arm"], row["seed"], row["epoch"]) for row in kept.rows["curves"]]

@@ -11,6 +11,7 @@ import pytest
 import transfer_run
 from pp_transfer import PPTransfer
 from run_directory import claimed
+from stopping import stopped_in
 
 from sumajax import evaluate, load_agent
 from sumajax.environments import PredatorPrey
@@ -127,20 +128,11 @@ def test_the_policy_of_a_run_can_be_used(toy):
         load_agent(toy.directory, seed=2)
 
 
-def test_a_stopped_run_goes_on_to_the_same_end(toy, tmp_path, monkeypatch):
+def test_a_stopped_run_goes_on_to_the_same_end(toy, tmp_path):
     whole = without_clock(toy.directory)
     again = replace(toy, output=tmp_path / "again")
-    record = transfer_run.Recorder._record
-
-    def stop_in_the_second_stage(self, stage, chunk):
-        record(self, stage, chunk)
-        if stage.arm == "transfer":
-            raise Stopped  # its rows are written, its checkpoint is not
-
-    monkeypatch.setattr(transfer_run.Recorder, "_record", stop_in_the_second_stage)
-    with pytest.raises(Stopped):
+    with stopped_in("transfer", Stopped):
         transfer_run.run_experiment(again)
-    monkeypatch.setattr(transfer_run.Recorder, "_record", record)
     transfer_run.run_experiment(again)
     assert without_clock(again.directory) == whole
     first, second = (load_agent(t.directory).params for t in (toy, again))

@@ -110,23 +110,29 @@ class TestGradient:
         """
         env = PredatorPrey(size=3, num_predators=2, max_steps=4)
         with jax.enable_x64(True):
-            plain = {"advantages": "raw", "team_reward": 0.0}
-            tiny = tiny_learner(env, "ic3net", num_envs=5, rollout_length=8, **plain)
-            assert tiny.config.mask_inactive
+            tiny = tiny_learner(env, "ic3net", num_envs=5, rollout_length=8)
+            config = tiny.config
+            assert config.mask_inactive
+            assert config.team_reward > 0
+            assert config.advantages == "centred"
             params, actors, draws, _ = in_float64(jax.jit(partial(gradient_inputs, tiny))())
             ours, (_, tally) = jax.jit(tiny._gradient)(params, actors, draws, jnp.int32(0))
             following, now = jax.jit(partial(rollout, env, tiny.policy))(params, actors, draws)
             beyond = last_value(env, tiny.policy, params, following)
-            target = now.value + estimate_advantages(now, beyond, tiny.config)
+            individual = now.value + estimate_advantages(now, beyond, config)
+            share = config.team_reward
+            target = (1 - share) * individual + share * individual.mean(-1, keepdims=True)
+            better = target - now.value
+            acting = now.active.astype(float)
+            better = better - (acting * better).sum() / acting.sum()
 
             @jax.jit
             def loss(params):
                 _, seen = rollout(env, tiny.policy, params, actors, draws)
-                advantages, acting = target - now.value, now.active.astype(float)
                 everyone = jnp.ones_like(acting)
-                policy, entropy = policy_gradient(seen.decisions, advantages, everyone, acting)
+                policy, entropy = policy_gradient(seen.decisions, better, everyone, acting)
                 critic = ((seen.value - target) ** 2).sum()
-                weights = tiny.config.value_weight, tiny.config.entropy_weight
+                weights = config.value_weight, config.entropy_weight
                 return policy + weights[0] * critic - weights[1] * entropy
 
             assert now.terminated.any()
