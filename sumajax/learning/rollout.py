@@ -5,6 +5,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from sumajax.environments.types import Environment
@@ -85,8 +86,10 @@ def select(condition: chex.Array, if_true: Any, if_false: Any) -> Any:
 
 def state_features(env: Environment, policy: Policy, params: Any) -> chex.Array | None:
     """(S, F) features of every state tensor the task has, or None where it has too many to list."""
-    table = env.state_table()
-    return None if table is None else policy.encode_states(params, table)
+    with jax.ensure_compile_time_eval():  # an encoder can make use of what is in it
+        table = env.state_table()
+        known = None if table is None else np.asarray(table)
+    return None if known is None else policy.encode_states(params, known)
 
 
 def act(

@@ -13,6 +13,7 @@ import numpy as np
 from flax import linen as nn
 
 from sumajax.policies.layers import Dense
+from sumajax.policies.lit_places import lit_places, sum_by_state
 
 EncoderKind = Literal["flat", "lab_gap", "linear"]
 ENCODERS = get_args(EncoderKind)
@@ -63,30 +64,62 @@ class Conv(nn.Module):
     stride: int = 1
     padding: Literal["SAME", "VALID"] = "VALID"
 
-    @nn.compact
+    def setup(self) -> None:
+        self.dense = Dense(self.features, before_relu=True)
+
     def __call__(self, x: chex.Array) -> chex.Array:
-        seen = patches(x, self.kernel, self.stride, self.padding)
-        return Dense(self.features, before_relu=True, name="dense")(seen)
+        return self.dense(self.patches(x))
+
+    def patches(self, x: chex.Array) -> chex.Array:
+        return patches(x, self.kernel, self.stride, self.padding)
 
 
 class StateEncoder(nn.Module):
-    """(S, 1, rows, columns) state tensors -> (S, 128)."""
+    """(S, 1, rows, columns) state tensors -> (S, 128).
+
+    A NumPy array is known when the program is compiled: `flat` then computes only what differs from
+    an empty grid (`lit_places`), the same to rounding.
+    """
 
     kind: EncoderKind = "flat"
 
-    @nn.compact
-    def __call__(self, states: chex.Array) -> chex.Array:
-        x = jnp.moveaxis(states, -3, -1)
+    def setup(self) -> None:
+        reached = None
         if self.kind == "flat":
-            x = nn.relu(Conv(8, kernel=3, padding="SAME", name="conv1")(x))
-            x = nn.relu(Conv(16, kernel=3, stride=2, padding="SAME", name="conv2")(x))
+            self.conv1 = Conv(8, kernel=3, padding="SAME")
+            self.conv2 = Conv(16, kernel=3, stride=2, padding="SAME")
+            reached = LIT_PATCHES * self.conv2.features
         if self.kind == "lab_gap":
-            x = nn.relu(Conv(64, kernel=3, name="conv1")(x))
-            x = nn.relu(Conv(STATE_FEATURES, kernel=2, name="conv2")(x))
+            self.conv1 = Conv(64, kernel=3)
+            self.conv2 = Conv(STATE_FEATURES, kernel=2)
+        else:
+            self.dense = Dense(STATE_FEATURES, fan_in=reached, before_relu=True)
+
+    def __call__(self, states: chex.Array) -> chex.Array:
+        if self.kind == "flat" and isinstance(states, np.ndarray):
+            return nn.relu(self._known(np.moveaxis(states, -3, -1)))
+        x = jnp.moveaxis(states, -3, -1)
+        if self.kind == "linear":
+            return nn.relu(self.dense(x.reshape(x.shape[0], -1)))
+        x = self._convolved(x)
+        if self.kind == "lab_gap":
             return x.mean((-3, -2))
-        reached = LIT_PATCHES * x.shape[-1] if self.kind == "flat" else None
-        dense = Dense(STATE_FEATURES, fan_in=reached, before_relu=True, name="dense")
-        return nn.relu(dense(x.reshape(x.shape[0], -1)))
+        return nn.relu(self.dense(x.reshape(x.shape[0], -1)))
+
+    def _convolved(self, x: chex.Array) -> chex.Array:
+        return nn.relu(self.conv2(nn.relu(self.conv1(x))))
+
+    def _known(self, states: np.ndarray) -> chex.Array:
+        """`dense` of the convolutions of states (S, rows, columns, 1), by the places they light."""
+        places = lit_places(states, self.conv1.patches, self.conv2.patches)
+        empty = self._convolved(jnp.zeros((1, *states.shape[1:])))
+        inner = nn.relu(self.conv1.dense(places.seen)) * places.exists[:, None, :, None]
+        lit = nn.relu(self.conv2.dense(inner.reshape(*places.state.shape, -1)))  # (P, M, channels)
+        differs = lit - empty.reshape(-1, 1, lit.shape[-1])
+        background = self.dense(empty.reshape(1, -1))
+        kernel, _ = self.dense.weights(empty.size)
+        of_place = differs @ kernel.reshape(*differs.shape[::2], -1)  # (P, M, features)
+        return background + sum_by_state(of_place, places)
 
 
 class ViewEncoder(nn.Module):

@@ -143,12 +143,13 @@ def test_encoding_all_states_once_changes_nothing(name):
     env, policy = CAPTURE_THREE, small(name, CAPTURE_THREE)
     obs, noise = observe(env, 0, (2,)), policy.sample_noise(jax.random.key(1), (2,))
     cell = obs.state.reshape(2, env.num_agents, -1).argmax(-1)
+    table = np.asarray(env.state_table())
 
     def direct(params):
         return policy.apply_with(params, policy.initial_carry((2,)), obs, noise)[1]
 
     def from_table(params):
-        features = policy.encode_states(params, env.state_table())[cell]
+        features = policy.encode_states(params, table)[cell]
         return policy.step(params, policy.initial_carry((2,)), features, obs.view, noise)[1]
 
     def gradient_and_output(act):

@@ -1,0 +1,84 @@
+"""Encoding known states by the places they light is encoding them whole."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sumajax.environments import PredatorPrey
+from sumajax.policies.encoder import StateEncoder
+from sumajax.policies.lit_places import lit_places, sum_by_state
+from sumajax.upsampling import StateUpsampled
+
+
+def random_states(share, size=7):
+    values = jax.random.normal(jax.random.key(3), (6, 1, size, size))
+    return values * jax.random.bernoulli(jax.random.key(4), share, values.shape)
+
+
+STATES = {
+    "native": PredatorPrey(size=10).state_table(),
+    "native, odd side": PredatorPrey(size=7).state_table(),
+    "not square": PredatorPrey(size=(4, 6)).state_table(),
+    "upsampled": StateUpsampled(PredatorPrey(size=5), size=10).state_table(),
+    "upsampled, mass": StateUpsampled(PredatorPrey(size=3), size=9, scale="mass").state_table(),
+    "corner": StateUpsampled(PredatorPrey(size=5), size=10, fill="corner").state_table(),
+    "empty": jnp.zeros((3, 1, 5, 5)),
+    "some lit": random_states(0.1),
+    "all lit": random_states(1.0),
+    "one cell": jnp.ones((1, 1, 1, 1)),
+}
+
+
+def parameters(states):
+    """Of the encoder, biases and all, so that an empty grid has features too."""
+    params = StateEncoder().init(jax.random.key(0), states)
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    moved = [x + 0.1 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
+    return tree.unflatten(moved)
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_known_states_have_the_features_and_gradients_of_states_given(name):
+    states, encoder = STATES[name], StateEncoder()
+    cotangent = jax.random.normal(jax.random.key(2), (len(states), 128))
+
+    def gradient(states):
+        def loss(params):
+            features = encoder.apply(params, states)
+            return (features * cotangent).sum(), features
+
+        return jax.grad(loss, has_aux=True)
+
+    params = parameters(states)
+    expected = jax.jit(gradient(states))(params)
+    known = jax.jit(gradient(np.asarray(states)))(params)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), known, expected
+    )
+
+
+def test_only_lit_places_are_kept():
+    """A one-hot cell of a 20x20 grid lights at most 3x3 of 10x10 places."""
+    encoder = StateEncoder().bind(parameters(jnp.zeros((1, 1, 20, 20))))
+    states = np.moveaxis(np.asarray(PredatorPrey(size=20).state_table()), 1, -1)
+    places = lit_places(states, encoder.conv1.patches, encoder.conv2.patches)
+    of_state = np.bincount(places.state.ravel(), minlength=401)
+    assert places.num_states == 400
+    assert of_state[:400].min() >= 1
+    assert of_state[:400].max() == 9
+    assert places.seen.shape[0] == 100
+    assert places.seen[places.state == 400].any(-1).any(-1).sum() == 0
+    assert not places.exists[-1].all()  # the last place reaches over the edge
+    assert places.exists[0].all()
+
+
+def test_sums_by_state_leave_out_what_fills_up():
+    states = np.zeros((2, 4, 4, 1), np.float32)
+    states[1, 0, 0] = 1
+    encoder = StateEncoder().bind(parameters(jnp.zeros((1, 1, 4, 4))))
+    places = lit_places(states, encoder.conv1.patches, encoder.conv2.patches)
+    ones = jnp.ones((*places.state.shape, 3))
+    lit = (places.state == 1).sum()
+    np.testing.assert_array_equal(sum_by_state(ones, places), [[0] * 3, [lit] * 3])
