@@ -18,6 +18,12 @@ def test_extending(capsys):
     assert capsys.readouterr().out.count("steps taken") == 2
 
 
+def test_jaxmarl(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", (DOCS / "jaxmarl.md").read_text(), re.DOTALL)
+    exec(compile(code, "jaxmarl.md", "exec"), {})
+    assert capsys.readouterr().out == "(43,) False [False False False]\n"
+
+
 @pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.name)
 def test_links(page):
     for link in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text()):

@@ -16,7 +16,9 @@ from rich.table import Table
 from rich.text import Text
 
 WIDTH = 80
-"""Columns of a table in a file, where there is no terminal to ask."""
+"""Columns of a table in a file, where there is no terminal to ask, or as many as it needs."""
+WIDEST = 1000
+"""And no more than that."""
 ENV_STEPS_PER_EPOCH = 20_000
 MISSING = "-"
 
@@ -280,16 +282,18 @@ def result_table(rows: Sequence[Mapping[str, Any]], title: str | None = None) ->
 def print_table(
     rows: Sequence[Mapping[str, Any]], title: str | None = None, file: TextIO | None = None
 ) -> None:
-    """Prints a `result_table`: in a terminal at its width, in a file at 80 columns and plain."""
-    file = sys.stdout if file is None else file
+    """Prints a `result_table`: in a terminal at its width, in a file whole and plain."""
+    file, table = sys.stdout if file is None else file, result_table(rows, title)
     if file.isatty():
-        Console(file=file).print(result_table(rows, title))
+        Console(file=file).print(table)
         return
     console = Console(
         file=file, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False
     )
+    needed = console.measure(table, options=console.options.update(width=WIDEST)).maximum
+    console.width = max(WIDTH, needed)
     with console.capture() as captured:
-        console.print(result_table(rows, title))
+        console.print(table)
     lines = [line.rstrip() for line in captured.get().splitlines()]
     print("\n".join(lines).strip("\n"), file=file, flush=True)
 
