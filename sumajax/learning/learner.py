@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.flatten_util import ravel_pytree
 
 from sumajax.environments.types import Environment
 from sumajax.learning import guard
@@ -190,7 +191,14 @@ class Learner:
         return loss, (jax.lax.stop_gradient(actors), tally_of(trajectory, valid, parts))
 
     def _over_devices(self, sums: Any) -> Any:
-        return sums if self.axis is None else jax.lax.psum(sums, self.axis)
+        """`sums` added up over devices, in one exchange: at each they wait for the slowest.
+
+        Counts travel as floats, exact up to 2**24 for an update.
+        """
+        if self.axis is None:
+            return sums
+        vector, restore = ravel_pytree(sums)
+        return restore(jax.lax.psum(vector, self.axis))
 
     def _keys(self, key: chex.PRNGKey, update: chex.Array) -> chex.PRNGKey:
         """(E,) keys of one update; each belongs to an environment, whatever device that is on."""
