@@ -180,6 +180,8 @@ def shown(cost: Cost) -> dict[str, str]:
 
 MEASURED, THEORY = "#0072b2", "#d55e00"
 """Blue and vermilion of Okabe and Ito, told apart by most of the colour-blind."""
+HEADROOM = 1.1
+"""Top of a panel over its highest point."""
 
 
 def draw(costs: list[Cost], file: Path) -> None:
@@ -200,7 +202,7 @@ def _panel(panel: Axes, varied: str, costs: list[Cost]) -> None:
     panel.set_xticks(values, map(str, values))
     panel.xaxis.set_minor_formatter(NullFormatter())
     panel.yaxis.set_major_formatter(ScalarFormatter())
-    panel.set_ylim(bottom=0)
+    panel.set_ylim(0, HEADROOM * max(max(c.growth, c.theory) for c in costs))
     panel.spines[["top", "right"]].set_visible(False)
 
 
