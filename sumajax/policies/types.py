@@ -119,7 +119,7 @@ class PolicyModule(nn.Module, ABC):
 
     def encode_and_step(self, carry: Any, obs: Observation, noise: Any) -> tuple[Any, PolicyOutput]:
         """`__call__` on the state tensors themselves: the direct path, for any state."""
-        flat = obs.state.reshape(-1, *obs.state.shape[-3:])
+        flat = jnp.reshape(obs.state, (-1, *obs.state.shape[-3:]))
         features = self.encode_states(flat).reshape(*obs.state.shape[:-3], -1)
         return self(carry, features, obs.view, noise)
 
