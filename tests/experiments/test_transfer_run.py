@@ -1,6 +1,8 @@
 """The whole experiment on a toy scale: its files, its table, going on after a stop, refusing."""
 
+import contextlib
 import csv
+import io
 import json
 from dataclasses import replace
 from functools import partial
@@ -28,13 +30,15 @@ class Stopped(Exception):
     """Stands for whatever ends a run in its middle."""
 
 
-@pytest.fixture(autouse=True)
-def small(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def small():
     """A small policy and few held-out episodes: the same program in seconds."""
-    monkeypatch.setattr(
-        transfer_run, "make_policy", lambda name, env: make_policy(name, env, hidden=8)
-    )
-    monkeypatch.setattr(transfer_run, "evaluate", partial(evaluate, episodes=16))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            transfer_run, "make_policy", lambda name, env: make_policy(name, env, hidden=8)
+        )
+        patch.setattr(transfer_run, "evaluate", partial(evaluate, episodes=16))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +54,15 @@ def toy(tmp_path_factory):
         learner=LearnerConfig(num_envs=100, rollout_length=20),
         output=tmp_path_factory.mktemp("runs") / "toy",
     )
+
+
+@pytest.fixture(scope="module")
+def finished(toy):
+    """What the run of `toy` returned and printed, after its end."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        summary = transfer_run.run_experiment(toy)
+    return summary, printed.getvalue()
 
 
 def rows(directory):
@@ -70,8 +83,8 @@ def test_the_rate_is_lower_after_a_transfer(toy):
     assert rates["transfer"] < full
 
 
-def test_a_run_from_start_to_end(toy, capsys):
-    summary = transfer_run.run_experiment(toy)
+def test_a_run_from_start_to_end(toy, finished):
+    summary, table = finished
     directory = toy.directory
     assert {path.name for path in directory.iterdir()} >= {
         "config.json",
@@ -97,11 +110,11 @@ def test_a_run_from_start_to_end(toy, capsys):
     assert set(written["comparison"]["env_steps_to_threshold"]) == {"transfer", "scratch"}
     assert len(written["zero_shot"]["success"]) == 2
     assert summary["arms"]["source"]["epochs"] == 2
-    table = capsys.readouterr().out
     for row in ("source", "zero shot", "transfer", "scratch", "shortest"):
         assert row in table
 
 
+@pytest.mark.usefixtures("finished")
 def test_the_table_marks_a_seed_that_stopped(toy):
     summary = json.loads((toy.directory / "summary.json").read_text())
     arms = {arm: summary[arm] for arm in ("source", "transfer", "scratch")}
@@ -112,6 +125,7 @@ def test_the_table_marks_a_seed_that_stopped(toy):
     assert "scratch 6x6" in names
 
 
+@pytest.mark.usefixtures("finished")
 def test_a_finished_run_is_not_overwritten(toy):
     before = (toy.directory / "summary.json").read_bytes()
     with pytest.raises(ValueError, match="holds a finished run"):
@@ -121,6 +135,7 @@ def test_a_finished_run_is_not_overwritten(toy):
     assert (toy.directory / "summary.json").read_bytes() == before
 
 
+@pytest.mark.usefixtures("finished")
 def test_the_policy_of_a_run_can_be_used(toy):
     agent = load_agent(toy.directory, seed=1)
     assert agent.env == toy.target
@@ -128,6 +143,7 @@ def test_the_policy_of_a_run_can_be_used(toy):
         load_agent(toy.directory, seed=2)
 
 
+@pytest.mark.usefixtures("finished")
 def test_a_stopped_run_goes_on_to_the_same_end(toy, tmp_path):
     whole = without_clock(toy.directory)
     again = replace(toy, output=tmp_path / "again")
@@ -140,6 +156,7 @@ def test_a_stopped_run_goes_on_to_the_same_end(toy, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.usefixtures("finished")
 def test_a_source_made_elsewhere(toy, tmp_path):
     target_only = replace(
         toy,
