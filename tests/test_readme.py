@@ -3,20 +3,27 @@
 import re
 from pathlib import Path
 
+from sumajax import checkpoint
+
 README = (Path(__file__).parents[1] / "README.md").read_text()
 NEEDS_A_RUN = "<!-- needs a finished run -->"
 
 
-def test_the_examples_run(capsys):
+def test_the_examples_run(capsys, tmp_path, monkeypatch):
+    """In order; what the first has trained stands for the run that the second one loads."""
+    monkeypatch.chdir(tmp_path)
     shared: dict = {}
     blocks = re.findall(rf"({NEEDS_A_RUN}\n)?```python\n(.*?)```", README, re.DOTALL)
     assert len(blocks) == 3
     for needs_a_run, code in blocks:
-        compile(code, "README.md", "exec")
-        if not needs_a_run:
-            exec(code, shared)
+        if needs_a_run:
+            (run,) = re.findall(r'load_agent\("(.*)"\)', code)
+            about = checkpoint.describe(shared["env"], shared["policy"])
+            checkpoint.save(Path(run) / "checkpoints" / "transfer", shared["state"], about)
+        exec(compile(code, "README.md", "exec"), shared)
     assert shared["metrics"].env_steps.tolist() == [20_000, 20_000]
     assert shared["output"].action.shape == (3,)
+    assert shared["action"].shape == (3,)
     assert shared["states"].agents.shape == (64, 5, 2)
     assert capsys.readouterr().out
 

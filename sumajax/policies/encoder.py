@@ -99,9 +99,8 @@ class StateEncoder(nn.Module):
         if self.kind == "flat" and isinstance(states, np.ndarray):
             return nn.relu(self._known(np.moveaxis(states, -3, -1)))
         x = jnp.moveaxis(states, -3, -1)
-        if self.kind == "linear":
-            return nn.relu(self.dense(x.reshape(x.shape[0], -1)))
-        x = self._convolved(x)
+        if self.kind != "linear":
+            x = self._convolved(x)
         if self.kind == "lab_gap":
             return x.mean((-3, -2))
         return nn.relu(self.dense(x.reshape(x.shape[0], -1)))

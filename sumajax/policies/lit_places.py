@@ -32,8 +32,8 @@ Patches = Callable[[chex.Array], chex.Array]
 def lit_places(states: np.ndarray, first: Patches, second: Patches) -> LitPlaces:
     """The places of `second` after `first` at which states (S, rows, columns, 1) are not empty."""
     with jax.ensure_compile_time_eval():
-        once = np.asarray(first(jnp.asarray(states)))
-        seen = np.asarray(second(jnp.asarray(once)))
+        once = np.asarray(first(states))
+        seen = np.asarray(second(once))
         exists = np.asarray(second(jnp.ones((1, *once.shape[1:3], 1))))
     num_states, inputs = len(states), once.shape[-1]
     seen = np.moveaxis(seen.reshape(num_states, -1, seen.shape[-1] // inputs, inputs), 0, 1)
