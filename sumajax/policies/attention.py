@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jax.nn.initializers import normal
 
+from sumajax.policies.layers import product
+
 SLOPE = 0.2
 """Of the LeakyReLU below zero."""
 ISOLATED = 1e-15
@@ -95,7 +97,7 @@ class GraphAttention(nn.Module):
 
         Rows of the graph receive, columns send; without a graph it is complete.
         """
-        w = (m @ self.W).reshape(*m.shape[:-1], self.heads, self.features)
+        w = product(m, self.W).reshape(*m.shape[:-1], self.heads, self.features)
         scores = pair_scores((w * self.a_i).sum(-1), (w * self.a_j).sum(-1))
         if graph is None:
             graph = jnp.ones(scores.shape[-3:-1], scores.dtype)

@@ -23,7 +23,13 @@ from sumajax.policies.encoder import (
     StateEncoder,
     ViewEncoder,
 )
-from sumajax.policies.layers import Dense, LSTMCell, straight_through_bit, uniform_fan_in
+from sumajax.policies.layers import (
+    Dense,
+    LSTMCell,
+    product,
+    straight_through_bit,
+    uniform_fan_in,
+)
 from sumajax.policies.types import (
     PolicyModule,
     PolicyOutput,
@@ -172,7 +178,7 @@ class HetLayer(nn.Module):
     def _apply_dense(self, names: list[str], x: chex.Array) -> dict[str, chex.Array]:
         """Several dense layers on one input as a single product."""
         kernels, biases = zip(*(self.dense[name] for name in names), strict=True)
-        y = x @ jnp.concatenate(kernels, axis=1) + jnp.concatenate(biases)
+        y = product(x, jnp.concatenate(kernels, axis=1)) + jnp.concatenate(biases)
         ends = np.cumsum([bias.shape[0] for bias in biases])[:-1]
         return dict(zip(names, jnp.split(y, ends, axis=-1), strict=True))
 
