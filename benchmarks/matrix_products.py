@@ -50,9 +50,9 @@ def multiply_adds(counted: Counter[Product]) -> int:
 
 
 def step_products(env: Environment, policy: Policy, num_envs: int) -> Counter[Product]:
-    """The products of one policy step in `num_envs` environments, states already encoded."""
+    """The products of one policy step in `num_envs` environments, all prepared that can be."""
     key = jax.random.key(0)
-    params = jax.eval_shape(policy.init, key)
+    params = jax.eval_shape(lambda: policy.prepare(policy.init(key)))
     carry = jax.eval_shape(lambda: policy.initial_carry((num_envs,)))
     team = policy.team
     states = jax.ShapeDtypeStruct((env.num_agents, *team.state_shape), jnp.float32)

@@ -55,7 +55,7 @@ def evaluate(
       greedy: every choice of the policy (action, gate, edge, bit) is its likeliest one; may be
         traced, so both kinds share one compiled program.
     """
-    features = state_features(env, policy, params)
+    features, params = state_features(env, policy, params), policy.prepare(params)
 
     def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
         noise = policy.sample_noise(key, actors.episode_return.shape[:1])

@@ -125,7 +125,7 @@ def rollout(
     `params` through the trajectory's logits and values, back through the agents' memory and
     messages to the start of the episode or of the segment, or over `detach_gap` steps.
     """
-    features = state_features(env, policy, params)
+    features, params = state_features(env, policy, params), policy.prepare(params)
     beginning = policy.initial_carry((actors.episode_return.shape[0],))
     agent_class = tuple(env.agent_class.tolist())
 

@@ -37,25 +37,29 @@ def gather_messages(weights: chex.Array, messages: chex.Array) -> chex.Array:
     return jnp.einsum("...ijk,...jko->...iko", weights, messages)
 
 
+def seen_through(kernel: chex.Array, vectors: chex.Array) -> chex.Array:
+    """Kernel (..., K O), attention vectors (K, O) -> (..., K): what turns its input into scores.
+
+    A score is linear in the features it is read off, so it can be had with them in one product.
+    """
+    per_head = kernel.reshape(*kernel.shape[:-1], *vectors.shape)
+    return jnp.einsum("...ko,ko->...k", per_head, vectors)
+
+
 def relation_attention(
-    receivers: chex.Array,
-    messages: chex.Array,
-    dst: chex.Array,
-    src: chex.Array,
-    exclude_self: bool = False,
+    receiver: chex.Array, sender: chex.Array, messages: chex.Array, exclude_self: bool = False
 ) -> tuple[chex.Array, chex.Array]:
     """What one relation of HetNet's adds to its receivers (algorithms.md 3.3).
 
     Args:
-      receivers: (..., R, K, O) self-transformed features.
+      receiver, sender: (..., R, K) and (..., S, K), each agent's share of the scores.
       messages: (..., S, K, O).
-      dst, src: (K, O) attention vectors.
       exclude_self: whether receiver i must not hear sender i; needs R = S > 1.
 
     Returns:
       (..., R, K, O) sums of messages, and the (..., R, S, K) weights, a softmax over senders.
     """
-    scores = pair_scores((receivers * dst).sum(-1), (messages * src).sum(-1))
+    scores = pair_scores(receiver, sender)
     if exclude_self:
         scores = scores + NO_EDGE * jnp.eye(scores.shape[-2])[..., None]
     weights = jax.nn.softmax(scores, axis=-2)
@@ -90,20 +94,34 @@ class GraphAttention(nn.Module):
         width = features if self.average else heads * features
         self.bias = self.param("bias", nn.initializers.zeros_init(), (width,))
 
+    def fold(self) -> chex.Array:
+        """(D, K O + 2 K): W, and the attention vectors of receivers and senders seen through it."""
+        vectors = [seen_through(self.W, a) for a in (self.a_i, self.a_j)]
+        return jnp.concatenate([self.W, *vectors], axis=-1)
+
     def __call__(
-        self, m: chex.Array, graph: chex.Array | None = None
+        self,
+        m: chex.Array,
+        graph: chex.Array | None = None,
+        folded: chex.Array | None = None,
     ) -> tuple[chex.Array, chex.Array]:
         """m (..., N, D), graph (..., N, N) -> output and weights (..., N, N, K).
 
-        Rows of the graph receive, columns send; without a graph it is complete.
+        Rows of the graph receive, columns send; without a graph it is complete. `folded` is what
+        `fold` returns, for who has it already.
         """
-        w = product(m, self.W).reshape(*m.shape[:-1], self.heads, self.features)
-        scores = pair_scores((w * self.a_i).sum(-1), (w * self.a_j).sum(-1))
+        y = product(m, self.fold() if folded is None else folded)
+        width = self.heads * self.features
+        w, receiver, sender = jnp.split(y, [width, width + self.heads], axis=-1)
+        w = w.reshape(*w.shape[:-1], self.heads, self.features)
+        scores = pair_scores(receiver, sender)
         if graph is None:
             graph = jnp.ones(scores.shape[-3:-1], scores.dtype)
         weights = self.weigh(scores, graph)
-        y = gather_messages(weights, w)
-        y = y.mean(-2) if self.average else y.reshape(*m.shape[:-1], -1)
+        if self.average:  # over senders and heads at once
+            y = jnp.einsum("...ijk,...jko->...io", weights, w) / self.heads
+        else:
+            y = gather_messages(weights, w).reshape(*m.shape[:-1], width)
         return y + self.bias, weights
 
     def weigh(self, scores: chex.Array, graph: chex.Array) -> chex.Array:

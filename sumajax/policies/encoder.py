@@ -157,7 +157,13 @@ class ObservationEncoder(nn.Module):
         self, state_features: chex.Array, view: chex.Array, sighted: np.ndarray
     ) -> chex.Array:
         """(..., N, features) of `encode_states`, view (..., N, c, m, m), sighted (N,) bool."""
+        return state_features + self.merge_view(self.see(view, sighted))
+
+    def see(self, view: chex.Array, sighted: np.ndarray) -> chex.Array:
+        """(..., N, 32): the views, encoded; 0 for who does not see."""
         seen = self.view_encoder(view)
-        if not sighted.all():
-            seen = seen * jnp.asarray(sighted, seen.dtype)[:, None]
-        return state_features + self.merge_view(seen)
+        return seen if sighted.all() else seen * jnp.asarray(sighted, seen.dtype)[:, None]
+
+    def view_kernel(self) -> chex.Array:
+        """(32, features): turns what is seen into its share of the merged features."""
+        return self.merge_view.weights(VIEW_FEATURES)[0]

@@ -15,7 +15,7 @@ from flax import linen as nn
 from flax import struct
 from jax.nn.initializers import normal
 
-from sumajax.policies.attention import relation_attention
+from sumajax.policies.attention import relation_attention, seen_through
 from sumajax.policies.encoder import (
     STATE_FEATURES,
     VIEW_FEATURES,
@@ -42,9 +42,13 @@ Meta = Literal["normalised", "repo"]
 
 NODES = ("P", "A", "S")
 """Predators, capture agents, and the two state nodes: the first is P's, the second A's."""
+BITS = "bits"
+"""What the decoders of binary messages read, as the other layers read nodes."""
 AGENT_RELATIONS = ("p2p", "a2p", "p2a", "a2a")
 STATE_RELATIONS = ("p2s", "a2s")
 """Relations, sender class first; a state node hears its own class only and tells nobody."""
+STATE_NODE = {"p2s": slice(0, 1), "a2s": slice(1, 2)}
+"""Which of the two state nodes hears."""
 
 CLASS_ACTIONS = (5, 6)
 """Widths of the two classes' heads, whatever the task: a capture agent can also capture."""
@@ -73,6 +77,10 @@ class Exchange:
     weights: dict[str, chex.Array]  # by relation with an edge: (..., receivers, senders, K)
     bits: chex.Array | None  # (..., N, bits) of 0 and 1, for binary messages
     bit_logits: chex.Array | None  # (..., N, bits, 2)
+
+
+Folded = dict[str, tuple[chex.Array, chex.Array]]
+"""Kernel and bias by what they read: a node's features, or bits."""
 
 
 def sender_of(relation: str) -> str:
@@ -130,8 +138,24 @@ class HetLayer(nn.Module):
         dst = self.param(f"{relation}_dst", init, (self.heads, width))
         return dst, self.param(f"{relation}_src", init, (self.heads, width))
 
+    def fold(self, relations: tuple[str, ...]) -> Folded:
+        """All the layers that read the same thing, and their scores, as one: kernel and bias.
+
+        Args:
+          relations: those that have an edge, from `present_relations`.
+        """
+        folded = {}
+        for read in (*NODES, BITS) if self.bits else NODES:
+            columns = [self._column(*what) for what in self._readings(read, relations).values()]
+            kernels, biases = zip(*columns, strict=True)
+            folded[read] = (jnp.concatenate(kernels, axis=-1), jnp.concatenate(biases))
+        return folded
+
     def __call__(
-        self, features: dict[str, chex.Array], noise: chex.Array | None = None
+        self,
+        features: dict[str, chex.Array],
+        noise: chex.Array | None = None,
+        folded: Folded | None = None,
     ) -> tuple[dict[str, chex.Array], Exchange]:
         """One round of messages.
 
@@ -139,48 +163,81 @@ class HetLayer(nn.Module):
           features: "P" (..., N_P, F_P), "A" (..., N_A, F_A), "S" (..., 2, F_S); a class may be
             empty.
           noise: (..., N, bits) logistic, predators first; only for binary messages.
+          folded: what `fold` returns, for who has it already.
 
         Returns:
           the next layer's features by node, and what was said.
         """
-        relations = present_relations(features["P"].shape[-2], features["A"].shape[-2])
+        num_p = features["P"].shape[-2]
+        relations = present_relations(num_p, features["A"].shape[-2])
+        folded = folded or self.fold(relations)
         linear: dict[str, chex.Array] = {}
         for node in NODES:
-            linear |= self._apply_dense(self._read_by(node, relations), features[node])
+            linear |= self._apply(node, relations, features[node], folded)
         bits = bit_logits = None
         if self.bits:
-            # Codes are no messages: they have no heads, and any number of bits will do.
             codes = jnp.concatenate([linear.pop("enc_P"), linear.pop("enc_A")], axis=-2)
             bits, bit_logits = self._binarize(codes, noise)
-            linear |= self._decode(bits, features["P"].shape[-2])
-        heads = {name: self._split_heads(y) for name, y in linear.items()}
-        state = heads["self_S"]
-        result = {"P": heads["self_P"], "A": heads["self_A"]}
-        result |= {"p2s": state[..., :1, :, :], "a2s": state[..., 1:, :, :]}
-        receivers, weights = dict(result), {}
+            linear |= self._decode(self._apply(BITS, relations, bits, folded), relations, num_p)
+        state = self._split_heads(linear["self_S"])
+        result = {"P": self._split_heads(linear["self_P"])}
+        result |= {"A": self._split_heads(linear["self_A"])}
+        result |= {relation: state[..., node, :, :] for relation, node in STATE_NODE.items()}
+        weights = {}
         for relation in relations:
             to = relation if relation in STATE_RELATIONS else receiver_of(relation)
+            hears = STATE_NODE.get(relation, slice(None))
             heard, weights[relation] = relation_attention(
-                receivers[to],
-                heads[relation],
-                *self.vectors[relation],
+                linear[f"{relation}_dst"][..., hears, :],
+                linear[f"{relation}_src"],
+                self._split_heads(linear[relation]),
                 exclude_self=sender_of(relation) == to,
             )
             result[to] = result[to] + heard
         return self._merge(result), Exchange(weights, bits, bit_logits)
 
-    def _read_by(self, node: str, relations: tuple[str, ...]) -> list[str]:
-        """The dense layers that read a node's features; one product does them all."""
-        sent = [r for r in relations if sender_of(r) == node and r in self.dense]
-        code = [name for name in (f"enc_{node}",) if name in self.dense]
-        return [f"self_{node}", *sent, *code]
+    def _readings(
+        self, read: str, relations: tuple[str, ...]
+    ) -> dict[str, tuple[str, chex.Array | None]]:
+        """All that is linear in a node's features, or in the bits: by name a dense layer, and for
+        a score the attention vectors that the layer's output is seen through.
+        """
+        if read == BITS:
+            layers = ["dec_P", "dec_A"]
+        else:
+            said = [r for r in relations if sender_of(r) == read and r in self.dense]
+            code = [name for name in (f"enc_{read}",) if name in self.dense]
+            layers = [f"self_{read}", *said, *code]
+        readings: dict[str, tuple[str, chex.Array | None]] = {name: (name, None) for name in layers}
+        for relation in relations:
+            dst, src = self.vectors[relation]
+            receiver = receiver_of(relation)
+            message = relation if relation in self.dense else f"dec_{receiver}"
+            if f"self_{receiver}" in layers:
+                readings[f"{relation}_dst"] = (f"self_{receiver}", dst)
+            if message in layers:
+                readings[f"{relation}_src"] = (message, src)
+        return readings
 
-    def _apply_dense(self, names: list[str], x: chex.Array) -> dict[str, chex.Array]:
-        """Several dense layers on one input as a single product."""
-        kernels, biases = zip(*(self.dense[name] for name in names), strict=True)
-        y = product(x, jnp.concatenate(kernels, axis=1)) + jnp.concatenate(biases)
-        ends = np.cumsum([bias.shape[0] for bias in biases])[:-1]
-        return dict(zip(names, jnp.split(y, ends, axis=-1), strict=True))
+    def _column(self, layer: str, vectors: chex.Array | None) -> tuple[chex.Array, chex.Array]:
+        """Kernel and bias of a layer, or of the scores that its output gives."""
+        kernel, bias = self.dense[layer]
+        if vectors is None:
+            return kernel, bias
+        return seen_through(kernel, vectors), seen_through(bias, vectors)
+
+    def _apply(
+        self, read: str, relations: tuple[str, ...], x: chex.Array, folded: Folded
+    ) -> dict[str, chex.Array]:
+        """All that is linear in x, by name, as a single product."""
+        kernel, bias = folded[read]
+        readings = self._readings(read, relations)
+        widths = [
+            self.dense[layer][1].shape[0] if vectors is None else self.heads
+            for layer, vectors in readings.values()
+        ]
+        parts = jnp.split(product(x, kernel) + bias, np.cumsum(widths)[:-1].tolist(), axis=-1)
+        return dict(zip(readings, parts, strict=True))
 
     def _binarize(
         self, codes: chex.Array, noise: chex.Array | None
@@ -190,14 +247,17 @@ class HetLayer(nn.Module):
         logits = codes[..., None] * kernel[0] + bias
         return straight_through_bit(logits, noise), logits
 
-    def _decode(self, bits: chex.Array, num_p: int) -> dict[str, chex.Array]:
-        """Bits (..., N, bits) -> messages by relation; the decoder is the receivers'."""
-        decoded = self._apply_dense(["dec_P", "dec_A"], bits)
+    def _decode(
+        self, decoded: dict[str, chex.Array], relations: tuple[str, ...], num_p: int
+    ) -> dict[str, chex.Array]:
+        """What the receivers' decoders made of all bits -> messages and scores by relation."""
         said_by = {"P": slice(None, num_p), "A": slice(num_p, None)}
-        return {
-            relation: decoded[f"dec_{receiver_of(relation)}"][..., said_by[sender_of(relation)], :]
-            for relation in AGENT_RELATIONS
-        }
+        messages = {}
+        for relation in filter(AGENT_RELATIONS.__contains__, relations):
+            senders = said_by[sender_of(relation)]
+            messages[relation] = decoded[f"dec_{receiver_of(relation)}"][..., senders, :]
+            messages[f"{relation}_src"] = decoded[f"{relation}_src"][..., senders, :]
+        return messages
 
     def _split_heads(self, y: chex.Array) -> chex.Array:
         """(..., N, K O) -> (..., N, K, O)."""
@@ -240,8 +300,18 @@ class HetGraph(nn.Module):
         self.critic_P = Dense(1)
         self.critic_A = Dense(1)
 
+    def fold(self, num_p: int, num_a: int) -> tuple[Folded, Folded]:
+        """Of both layers, for a team of so many."""
+        relations = present_relations(num_p, num_a)
+        return self.layer1.fold(relations), self.layer2.fold(relations)
+
     def __call__(
-        self, f_p: chex.Array, f_a: chex.Array, meta: chex.Array, noise: chex.Array | None = None
+        self,
+        f_p: chex.Array,
+        f_a: chex.Array,
+        meta: chex.Array,
+        noise: chex.Array | None = None,
+        folded: tuple[Folded, Folded] | None = None,
     ) -> tuple[dict[str, chex.Array], chex.Array, tuple[Exchange, Exchange]]:
         """f_p (..., N_P, F_P), f_a (..., N_A, F_A), meta (2, 4), noise (..., 2, N, bits) by layer.
 
@@ -250,8 +320,9 @@ class HetGraph(nn.Module):
           said in each layer.
         """
         noises = (noise[..., 0, :, :], noise[..., 1, :, :]) if noise is not None else (None, None)
-        hidden, first = self.layer1({"P": f_p, "A": f_a, "S": meta}, noises[0])
-        out, second = self.layer2(hidden, noises[1])
+        layer1, layer2 = folded or (None, None)
+        hidden, first = self.layer1({"P": f_p, "A": f_a, "S": meta}, noises[0], layer1)
+        out, second = self.layer2(hidden, noises[1], layer2)
         state = nn.relu(out["S"])
         critics = (self.critic_P(state[..., 0, :]), self.critic_A(state[..., 1, :]))
         logits = {"P": out["P"], "A": out["A"]}
@@ -284,6 +355,7 @@ class HetNetCore(nn.Module):
         x_obs: chex.Array,
         meta: chex.Array,
         noise: chex.Array | None = None,
+        folded: tuple[Folded, Folded] | None = None,
     ) -> tuple[HetNetCarry, dict[str, chex.Array], chex.Array, tuple[Exchange, Exchange]]:
         """projected_state (..., N, 512), x_obs (..., N_P, 32); the rest as in `HetGraph`."""
         num_p = x_obs.shape[-2]
@@ -292,7 +364,7 @@ class HetNetCore(nn.Module):
         )
         h_obs, s_obs = self.lstm_obs((carry.h_obs, carry.s_obs), x_obs)
         f_p = jnp.concatenate([h_state[..., :num_p, :], h_obs], axis=-1)
-        logits, value, exchanges = self.graph(f_p, h_state[..., num_p:, :], meta, noise)
+        logits, value, exchanges = self.graph(f_p, h_state[..., num_p:, :], meta, noise, folded)
         return HetNetCarry(h_state, s_state, h_obs, s_obs), logits, value, exchanges
 
 
@@ -324,6 +396,10 @@ class HetNet(PolicyModule):
     def encode_states(self, states: chex.Array) -> chex.Array:
         return self.core.project_states(self.state_encoder(states))
 
+    def fold(self) -> dict[str, Any]:
+        layers = self.core.graph.fold(self.team.class_size(0), self.team.class_size(1))
+        return {"layers": layers}
+
     def __call__(
         self, carry: HetNetCarry, state_features: chex.Array, view: chex.Array, noise: Any
     ) -> tuple[HetNetCarry, PolicyOutput]:
@@ -331,7 +407,7 @@ class HetNet(PolicyModule):
         x_obs = self.view_encoder(view[..., :num_p, :, :, :])
         meta = jnp.asarray(team_descriptor(self.team, self.meta), state_features.dtype)
         carry, logits, value, exchanges = self.core(
-            carry, state_features, x_obs, meta, noise.get("bits")
+            carry, state_features, x_obs, meta, noise.get("bits"), self.folded()["layers"]
         )
         agent_logits = mask_actions(_join_logits(logits, self.team.num_actions), self.team)
         batch = value.shape[:-1]

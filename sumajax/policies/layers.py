@@ -111,6 +111,21 @@ class LSTMCell(nn.Module):
         h, s = carry
         return lstm_gates(projected + product(h, self.w_hh), s)
 
+    def fold(self, kernel: chex.Array) -> chex.Array:
+        """(I + H, 4H) for `step_folded`, of an input that is y @ kernel (I, H)."""
+        return jnp.concatenate([kernel @ self.w_ih, self.w_hh])
+
+    def step_folded(
+        self,
+        carry: tuple[chex.Array, chex.Array],
+        projected: chex.Array,
+        y: chex.Array,
+        folded: chex.Array,
+    ) -> tuple[chex.Array, chex.Array]:
+        """`__call__` with x = constant + y @ kernel, from `project_input(constant)` and `fold`."""
+        h, s = carry
+        return lstm_gates(projected + product(jnp.concatenate([y, h], axis=-1), folded), s)
+
 
 @jax.custom_vjp
 def lstm_gates(z: chex.Array, s: chex.Array) -> tuple[chex.Array, chex.Array]:

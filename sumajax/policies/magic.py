@@ -11,12 +11,14 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
+from jax.scipy.linalg import block_diag
 
 from sumajax.policies.attention import GraphAttention
 from sumajax.policies.encoder import EncoderKind, ObservationEncoder
 from sumajax.policies.layers import (
     Dense,
     LSTMCell,
+    product,
     side_by_side,
     straight_through_bit,
     uniform_fan_in,
@@ -59,16 +61,24 @@ class Scheduler(nn.Module):
             )
             setattr(self, f"bias_{layer}", self.param(f"bias_{layer}", init, (q, fan_out)))
 
-    def __call__(self, e: chex.Array) -> chex.Array:
+    def fold(self) -> dict[str, chex.Array]:
+        """The kernels of all graphs side by side: of receivers and senders, then block diagonal."""
+        receiver, sender = jnp.split(self.kernel_0, 2, axis=1)
+        return {
+            "first": jnp.concatenate([*receiver, *sender], axis=-1),  # (G, 2 Q G/2)
+            "second": block_diag(*self.kernel_1),  # (Q G/2, Q G/2)
+            "third": block_diag(*self.kernel_2),  # (Q G/2, Q 2)
+        }
+
+    def __call__(self, e: chex.Array, folded: dict[str, chex.Array] | None = None) -> chex.Array:
         """e (..., N, G) -> logits (..., Q, N, N, 2); row i receives, column j sends."""
-        halves = jnp.split(self.kernel_0, 2, axis=1)
-        receiver, sender = (jnp.einsum("...nc,qcd->...qnd", e, half) for half in halves)
-        bias_0, bias_1, bias_2 = (
-            bias[:, None, None] for bias in (self.bias_0, self.bias_1, self.bias_2)
-        )
-        x = nn.relu(receiver[..., :, None, :] + sender[..., None, :, :] + bias_0)
-        x = nn.relu(jnp.einsum("...qijc,qcd->...qijd", x, self.kernel_1) + bias_1)
-        return jnp.einsum("...qijc,qcd->...qijd", x, self.kernel_2) + bias_2
+        kernels = self.fold() if folded is None else folded
+        receiver, sender = jnp.split(product(e, kernels["first"]), 2, axis=-1)
+        pairs = receiver[..., :, None, :] + sender[..., None, :, :]
+        x = nn.relu(pairs + self.bias_0.reshape(-1))
+        x = nn.relu(product(x, kernels["second"]) + self.bias_1.reshape(-1))
+        logits = product(x, kernels["third"]) + self.bias_2.reshape(-1)
+        return jnp.moveaxis(logits.reshape(*pairs.shape[:-1], self.graphs, 2), -2, -4)
 
 
 class MAGICCore(nn.Module):
@@ -103,20 +113,45 @@ class MAGICCore(nn.Module):
         self.action = Dense(self.num_actions)
         self.value = Dense(1)
 
+    def project_input(self, x: chex.Array) -> chex.Array:
+        """Encoded observations (..., H), or what is constant in them, -> (..., 4H)."""
+        return self.lstm.project_input(x)
+
+    def fold(self, view_kernel: chex.Array) -> dict[str, Any]:
+        """Products of weights that every step needs.
+
+        Args:
+          view_kernel: (V, H), which turns what is seen into its share of the encoded observation.
+        """
+        return {
+            "lstm": self.lstm.fold(view_kernel),
+            "gat_enc": self.gat_enc.fold(),
+            "gat1": self.gat1.fold(),
+            "gat2": self.gat2.fold(),
+            "scheduler": self.scheduler.fold(),
+        }
+
     def __call__(
-        self, carry: MAGICCarry, x: chex.Array, graph_noise: chex.Array
+        self,
+        carry: MAGICCarry,
+        projected: chex.Array,
+        seen: chex.Array,
+        graph_noise: chex.Array,
+        folded: dict[str, Any],
     ) -> tuple[MAGICCarry, chex.Array, chex.Array, chex.Array, chex.Array]:
-        """x (..., N, H), graph_noise (..., Q, N, N) logistic; Q is 2, or 1 without a second graph.
+        """projected (..., N, 4H), seen (..., N, V), graph_noise (..., Q, N, N) logistic.
+
+        Q is 2, or 1 without a second graph.
 
         Returns:
           carry, action logits (..., N, num_actions), value (..., N), graphs (..., Q, N, N) 0/1 and
           the first round's attention (..., N, N), the mean over its heads.
         """
-        h, s = self.lstm((carry.h, carry.s), x)
-        encoded, _ = self.gat_enc(h)
-        graphs = straight_through_bit(self.scheduler(encoded), graph_noise)
-        message, weights = self.gat1(h, graphs[..., 0, :, :])
-        message, _ = self.gat2(nn.elu(message), graphs[..., -1, :, :])
+        h, s = self.lstm.step_folded((carry.h, carry.s), projected, seen, folded["lstm"])
+        encoded, _ = self.gat_enc(h, folded=folded["gat_enc"])
+        graphs = straight_through_bit(self.scheduler(encoded, folded["scheduler"]), graph_noise)
+        message, weights = self.gat1(h, graphs[..., 0, :, :], folded["gat1"])
+        message, _ = self.gat2(nn.elu(message), graphs[..., -1, :, :], folded["gat2"])
         if self.decode_messages:
             message = self.decoder(message)
         y = jnp.concatenate([h, message], axis=-1)
@@ -136,13 +171,18 @@ class MAGIC(PolicyModule):
         self.core = MAGICCore(self.hidden, self.team.num_actions, **SETTINGS[self.setting])
 
     def encode_states(self, states: chex.Array) -> chex.Array:
-        return self.observation.encode_states(states)
+        return self.core.project_input(self.observation.encode_states(states))
+
+    def fold(self) -> dict[str, Any]:
+        return self.core.fold(self.observation.view_kernel())
 
     def __call__(
         self, carry: MAGICCarry, state_features: chex.Array, view: chex.Array, noise: Any
     ) -> tuple[MAGICCarry, PolicyOutput]:
-        x = self.observation(state_features, view, self.team.sighted)
-        carry, logits, value, graphs, attention = self.core(carry, x, noise["graph"])
+        seen = self.observation.see(view, self.team.sighted)
+        carry, logits, value, graphs, attention = self.core(
+            carry, state_features, seen, noise["graph"], self.folded()
+        )
         output = PolicyOutput(
             decisions={"action": decide(mask_actions(logits, self.team), noise["action"])},
             value=value,

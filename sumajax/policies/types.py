@@ -18,6 +18,8 @@ from flax import struct
 
 from sumajax.environments.types import Environment, Observation
 
+FOLDED = "folded"
+"""Name of the variables that `Policy.prepare` adds to the parameters."""
 MASKED_LOGIT = -1e9
 """Logit of an action that an agent's class does not have: probability exactly 0 in float32."""
 
@@ -96,6 +98,15 @@ class PolicyModule(nn.Module, ABC):
     def encode_states(self, states: chex.Array) -> chex.Array:
         """(S, 1, rows, columns) state tensors -> (S, F) features, whatever `__call__` expects."""
 
+    def fold(self) -> dict[str, Any]:
+        """Products of weights that every step needs and that are the same at each, if any."""
+        return {}
+
+    def folded(self) -> dict[str, Any]:
+        """What `fold` returns: as it was prepared for many steps, or anew."""
+        prepared = self.variables.get(FOLDED)
+        return self.fold() if prepared is None else dict(prepared)
+
     @abstractmethod
     def __call__(
         self, carry: Any, state_features: chex.Array, view: chex.Array, noise: Any
@@ -170,6 +181,11 @@ class Policy:
     def encode_states(self, params: Any, states: chex.Array) -> chex.Array:
         """(S, 1, rows, columns) -> (S, F), for `step`; cheapest for a NumPy array."""
         return self.module.apply(params, states, method=self.module.encode_states)
+
+    def prepare(self, params: Any) -> Any:
+        """The parameters with all that does not change from step to step worked out, for `step`."""
+        folded = self.module.apply(params, method=self.module.fold)
+        return {**params, FOLDED: folded} if folded else params
 
     def step(
         self, params: Any, carry: Any, state_features: chex.Array, view: chex.Array, noise: Any

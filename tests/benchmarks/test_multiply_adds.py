@@ -48,7 +48,7 @@ def test_products_are_nearly_all_that_the_compiler_counts(name, env):
     policy, num_envs = make_policy(name, env), 4
     counted = 2 * multiply_adds(step_products(env, policy, num_envs))
     key = jax.random.key(0)
-    params = policy.init(key)
+    params = policy.prepare(policy.init(key))
     states = jnp.zeros((env.num_agents, *policy.team.state_shape))
     width = policy.encode_states(params, states).shape[-1]
     analysis = jax.jit(policy.step).lower(

@@ -115,13 +115,16 @@ def answer_magic(fields: Arrays) -> Arrays:
     )
     graphs = jnp.stack([fields[f"in.graph{q + 1}"] for q in range(rounds)], axis=2)
     params = {"params": magic_parameters(fields, rounds)}
+    folded = core.apply(params, jnp.zeros((0, x.shape[-1]), x.dtype), method=core.fold)
 
     def step(carry, inputs):
         x, graphs = inputs
-        (carry, logits, value, drawn, _), seen = core.apply(
-            params, carry, x, forcing(graphs, x.dtype), capture_intermediates=True
+        projected = core.apply(params, x, method=core.project_input)
+        nothing_seen, noise = x[..., :0], forcing(graphs, x.dtype)
+        (carry, logits, value, drawn, _), caught = core.apply(
+            params, carry, projected, nothing_seen, noise, folded, capture_intermediates=True
         )
-        layer = returned(seen["intermediates"])
+        layer = returned(caught["intermediates"])
         out = {"out.h": carry.h, "out.s": carry.s, "out.value": value}
         out["out.logp_action"] = jax.nn.log_softmax(logits)
         out |= {f"out.{name}": layer[name][0] for name in ("gat_enc", "gat1", "gat2")}

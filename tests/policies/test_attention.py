@@ -112,16 +112,16 @@ def test_initial_weights_have_the_published_spread():
 
 @pytest.fixture(scope="module")
 def relation():
-    """Receivers (3, K, O), messages (3, K, O) and the two attention vectors."""
-    keys = jax.random.split(jax.random.key(0), 4)
-    shapes = [(3, HEADS, FEATURES)] * 2 + [(HEADS, FEATURES)] * 2
+    """Receivers' and senders' shares of the scores (3, K) and messages (3, K, O)."""
+    keys = jax.random.split(jax.random.key(0), 3)
+    shapes = [(3, HEADS), (3, HEADS), (3, HEADS, FEATURES)]
     return [jax.random.normal(key, shape) for key, shape in zip(keys, shapes, strict=True)]
 
 
 def test_a_relation_weighs_its_senders_by_a_softmax(relation):
-    receivers, messages, dst, src = relation
+    receiver, sender, messages = relation
     heard, weights = relation_attention(*relation)
-    scores = (receivers * dst).sum(-1)[:, None] + (messages * src).sum(-1)[None]
+    scores = receiver[:, None] + sender[None]
     scores = np.where(scores > 0, scores, 0.2 * scores)
     expected = np.exp(scores) / np.exp(scores).sum(1, keepdims=True)
     np.testing.assert_allclose(weights, expected, rtol=1e-5)
@@ -135,6 +135,6 @@ def test_a_relation_within_a_class_has_no_self_edge(relation):
 
 
 def test_a_single_sender_is_heard_in_full(relation):
-    receivers, messages, dst, src = relation
-    heard, _ = relation_attention(receivers, messages[:1], dst, src)
+    receiver, sender, messages = relation
+    heard, _ = relation_attention(receiver, sender[:1], messages[:1])
     np.testing.assert_allclose(heard, jnp.broadcast_to(messages[:1], heard.shape), rtol=1e-6)

@@ -138,8 +138,8 @@ def test_actions_a_class_does_not_have_are_never_taken(many_samples):
 
 
 @each_policy
-def test_encoding_all_states_once_changes_nothing(name):
-    """Features gathered by cell give the values and gradients of encoding every agent's tensor."""
+def test_what_is_prepared_for_many_steps_changes_nothing(name):
+    """Features gathered by cell and folded weights: the values and gradients of a step alone."""
     env, policy = CAPTURE_THREE, small(name, CAPTURE_THREE)
     obs, noise = observe(env, 0, (2,)), policy.sample_noise(jax.random.key(1), (2,))
     cell = obs.state.reshape(2, env.num_agents, -1).argmax(-1)
@@ -149,7 +149,7 @@ def test_encoding_all_states_once_changes_nothing(name):
         return policy.apply_with(params, policy.initial_carry((2,)), obs, noise)[1]
 
     def from_table(params):
-        features = policy.encode_states(params, table)[cell]
+        features, params = policy.encode_states(params, table)[cell], policy.prepare(params)
         return policy.step(params, policy.initial_carry((2,)), features, obs.view, noise)[1]
 
     def gradient_and_output(act):
