@@ -45,10 +45,10 @@ NODES = ("P", "A", "S")
 BITS = "bits"
 """What the decoders of binary messages read, as the other layers read nodes."""
 AGENT_RELATIONS = ("p2p", "a2p", "p2a", "a2a")
-STATE_RELATIONS = ("p2s", "a2s")
-"""Relations, sender class first; a state node hears its own class only and tells nobody."""
 STATE_NODE = {"p2s": slice(0, 1), "a2s": slice(1, 2)}
-"""Which of the two state nodes hears."""
+"""Which of the two state nodes hears in a relation."""
+STATE_RELATIONS = tuple(STATE_NODE)
+"""Relations, sender class first; a state node hears its own class only and tells nobody."""
 
 CLASS_ACTIONS = (5, 6)
 """Widths of the two classes' heads, whatever the task: a capture agent can also capture."""

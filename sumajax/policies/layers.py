@@ -95,10 +95,8 @@ class LSTMCell(nn.Module):
         self, carry: tuple[chex.Array, chex.Array], x: chex.Array
     ) -> tuple[chex.Array, chex.Array]:
         """carry (h, s), each (..., H), and x (..., U) -> the next (h, s); one matrix product."""
-        h, s = carry
         weights = jnp.concatenate([self.w_ih, self.w_hh])
-        z = product(jnp.concatenate([x, h], axis=-1), weights) + (self.b_ih + self.b_hh)
-        return lstm_gates(z, s)
+        return self.step_folded(carry, self.b_ih + self.b_hh, x, weights)
 
     def project_input(self, x: chex.Array) -> chex.Array:
         """x (..., U) -> (..., 4H): its share of z and both biases, for `step_projected`."""
