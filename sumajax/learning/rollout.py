@@ -1,5 +1,6 @@
 """One scan over environment and policy, differentiable with respect to the policy's parameters."""
 
+from dataclasses import replace
 from typing import Any
 
 import chex
@@ -9,6 +10,7 @@ import numpy as np
 from flax import struct
 
 from sumajax.environments.types import Environment
+from sumajax.learning.windows import windows
 from sumajax.policies.types import Decision, Policy
 
 
@@ -121,23 +123,33 @@ def rollout(
 ) -> tuple[Actors, Trajectory]:
     """T steps of E environments; ended episodes are followed by `draws.fresh` ones.
 
-    The state tensors are encoded once, before the scan, and gathered by cell. Gradients reach
-    `params` through the trajectory's logits and values, back through the agents' memory and
-    messages to the start of the episode or of the segment, or over `detach_gap` steps.
+    Gradients reach `params` through the trajectory's logits and values, back through the agents'
+    memory and messages to the start of the episode or of the segment, or over `detach_gap` steps.
+    """
+    if detach_gap is None:
+        actors, (_, trajectory) = play(env, policy, params, actors, draws)
+        return actors, trajectory
+    actors, (before, trajectory) = play(env, policy, jax.lax.stop_gradient(params), actors, draws)
+    return actors, relive(env, policy, params, before, draws.noise, trajectory, detach_gap)
+
+
+def play(
+    env: Environment, policy: Policy, params: Any, actors: Actors, draws: Draws
+) -> tuple[Actors, tuple[Actors, Trajectory]]:
+    """`rollout` without a gap; and the actors before each step, leaves (T, E, ...).
+
+    The state tensors are encoded once, before the scan, and gathered by cell.
     """
     features, params = state_features(env, policy, params), policy.prepare(params)
     beginning = policy.initial_carry((actors.episode_return.shape[0],))
     agent_class = tuple(env.agent_class.tolist())
 
-    def body(actors: Actors, draws: Draws) -> tuple[Actors, Trajectory]:
+    def body(actors: Actors, draws: Draws) -> tuple[Actors, tuple[Actors, Trajectory]]:
         active = jax.vmap(env.active)(actors.env_state)
         carry, output = act(env, policy, params, features, actors, draws.noise)
         env_state, transition = jax.vmap(env.step)(actors.env_state, output.action)
         episode_return = actors.episode_return + transition.reward
         done = transition.terminated | transition.truncated
-        if detach_gap is not None:
-            cut = transition.steps_taken % detach_gap == 0
-            carry = select(cut, jax.lax.stop_gradient(carry), carry)
         following = Actors(
             env_state=select(done, draws.fresh, env_state),
             carry=select(done, beginning, carry),
@@ -157,9 +169,48 @@ def rollout(
             agent_class=agent_class,
             max_steps=env.max_steps,
         )
-        return following, step
+        return following, (actors, step)
 
     return jax.lax.scan(body, actors, draws)
+
+
+def relive(
+    env: Environment,
+    policy: Policy,
+    params: Any,
+    before: Actors,
+    noise: Any,
+    trajectory: Trajectory,
+    gap: int,
+) -> Trajectory:
+    """`trajectory` with logits and values that gradients reach `params` through.
+
+    The same as a scan that cuts memory off, in fewer and wider steps: the derivative with respect
+    to a weight is added up once for many steps, and not at every single one.
+
+    Args:
+      before, noise: leaves (T, E, ...): the actors and the policy's random numbers of each step.
+    """
+    features, params = state_features(env, policy, params), policy.prepare(params)
+    cut = trajectory.last | (trajectory.steps_taken % gap == 0)  # (T, E): after the step
+    begins = jnp.roll(cut, 1, axis=0).at[0].set(True)
+    pieces = windows(begins, gap)
+
+    def body(carry: Any, now: tuple[chex.Array, Actors, Any]) -> tuple[Any, Any]:
+        begins, actors, noise = now
+        actors = replace(actors, carry=select(begins, actors.carry, carry))
+        carry, output = act(env, policy, params, features, actors, noise)
+        logits = {name: decision.logits for name, decision in output.decisions.items()}
+        return carry, (logits, output.value)
+
+    steps = pieces.split((begins, before, noise))
+    _, again = jax.lax.scan(body, policy.initial_carry(steps[0].shape[1:]), steps)
+    logits, value = pieces.join(again)
+    decisions = {
+        name: replace(decision, logits=logits[name])
+        for name, decision in trajectory.decisions.items()
+    }
+    return replace(trajectory, decisions=decisions, value=value)
 
 
 def last_value(env: Environment, policy: Policy, params: Any, actors: Actors) -> chex.Array:
