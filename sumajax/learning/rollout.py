@@ -186,7 +186,8 @@ def relive(
     """`trajectory` with logits and values that gradients reach `params` through.
 
     The same as a scan that cuts memory off, in fewer and wider steps: the derivative with respect
-    to a weight is added up once for many steps, and not at every single one.
+    to a weight is added up once for many steps, and not at every single one. Choices stay those
+    that were made, whatever rounding makes of the logits.
 
     Args:
       before, noise: leaves (T, E, ...): the actors and the policy's random numbers of each step.

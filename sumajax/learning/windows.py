@@ -51,11 +51,11 @@ class Windows:
 
 
 def windows(begins: chex.Array, gap: int) -> Windows:
-    """Windows that start where `begins` does, at the first such step after each multiple of W.
+    """Windows that start at the first step of `begins` at or after each so many gaps.
 
     Args:
-      begins: (T, E) bool: memory is constant before the step; so it is before the first one, and of
-        any `gap` steps in a row before at least one.
+      begins: (T, E) bool: memory is constant before the step. It is before the first one, and
+        before at least one of any `gap` steps in a row.
     """
     length, num_envs = begins.shape
     shortest = min(GAPS_IN_WINDOW * gap, length)

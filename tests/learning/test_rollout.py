@@ -1,6 +1,6 @@
 """The scan over environment and policy against a loop over both, and where gradients flow."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import jax
@@ -10,7 +10,8 @@ import pytest
 from trajectories import TINY_TASK, Clock, summing_policy, tiny_learner
 
 from sumajax.environments import PredatorPrey
-from sumajax.learning.rollout import draw, last_value, rollout, start
+from sumajax.learning.rollout import act, draw, last_value, rollout, select, start
+from sumajax.learning.windows import GAPS_IN_WINDOW
 
 STEPS, ENVS = 12, 3  # more than two episodes of at most 5 steps
 
@@ -130,6 +131,60 @@ def test_the_gap_changes_no_value():
     env, policy, params, actors, draws = scene()
     cut = jax.jit(partial(rollout, env, policy, detach_gap=2))(params, actors, draws)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), cut, rolled())
+
+
+def one_long_scan(env, policy, params, actors, draws, gap):
+    """Logits and values (T, E, N, ...) of a scan that cuts memory where the gap says."""
+    beginning = policy.initial_carry((ENVS,))
+
+    def body(actors, now):
+        carry, output = act(env, policy, params, None, actors, now.noise)
+        env_state, transition = jax.vmap(env.step)(actors.env_state, output.action)
+        cut = transition.steps_taken % gap == 0
+        done = transition.terminated | transition.truncated
+        carry = select(cut, jax.lax.stop_gradient(carry), carry)
+        env_state, carry = select(done, (now.fresh, beginning), (env_state, carry))
+        decisions = {name: decision.logits for name, decision in output.decisions.items()}
+        return replace(actors, env_state=env_state, carry=carry), (decisions, output.value)
+
+    return jax.lax.scan(body, actors, draws)[1]
+
+
+@pytest.mark.parametrize("policy", ["ic3net", "magic", "hetnet"])
+def test_gradients_are_those_of_one_long_scan_that_cuts_memory(policy):
+    """The pieces that it is gone through in are a matter of speed only."""
+    gap, steps = 2, 40
+    assert steps > 2 * GAPS_IN_WINDOW * gap
+    learner = tiny_learner(policy=policy)
+    env, policy = learner.env, learner.policy
+    params = jax.jit(policy.init)(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), ENVS)
+    actors, draws = start(env, policy, keys), draw(env, policy, keys, steps)
+    names = ("value", "action", "gate")
+    weight = dict(
+        zip(names, np.random.default_rng(0).normal(size=(3, steps, ENVS, 1)), strict=True)
+    )
+
+    def weighed(logits, value):
+        chosen = sum((weight[name][..., None] * x**2).sum() for name, x in logits.items())
+        return chosen + (weight["value"] * value).sum()
+
+    def ours(params):
+        _, seen = rollout(env, policy, params, actors, draws, gap)
+        return weighed({name: d.logits for name, d in seen.decisions.items()}, seen.value)
+
+    def reference(params):
+        return weighed(*one_long_scan(env, policy, params, actors, draws, gap))
+
+    (a, ours), (b, expected) = (
+        jax.jit(jax.value_and_grad(objective))(params) for objective in (ours, reference)
+    )
+    np.testing.assert_allclose(a, b, rtol=1e-4)
+    largest = max(np.abs(leaf).max() for leaf in jax.tree.leaves(expected))
+    jax.tree.map(
+        partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5 * largest), ours, expected
+    )
+    assert largest > 1e-2
 
 
 @dataclass(frozen=True)
