@@ -40,8 +40,8 @@ TABLE_1 = SELECTIONS[:6]
 FAST_SOURCE_EPOCHS = 50
 FAST_TARGET_EPOCHS = {"pp-ic3net": 125, "pcp-hetnet-2p1c": 150, "pcp-hetnet-3p2c": 150}
 FAST_TARGET_EPOCHS_OTHERS = 60
-"""Of preset `fast`: 1.0 M source steps; on the target 2.5 M for IC3Net, 3.0 M for PCP, where scratch
-only begins to learn after 1.2 M, and 1.2 M for the others."""
+"""Of preset `fast`: 1.0 M source steps; on the target 2.5 M for IC3Net, 3.0 M for PCP, where
+scratch only begins to learn after 1.2 M, and 1.2 M for the others."""
 
 ABLATED = ("pp-ic3net", "pp-hetnet")
 """Experiments that the ablations change."""
