@@ -10,6 +10,7 @@ from math import inf, nan
 import numpy as np
 import paper_parts
 import paper_results
+import paper_speed
 import pytest
 import reproduce_paper
 import transfer_run
@@ -508,3 +509,21 @@ def test_checkpoints_are_found_in_imported_runs(tiny, tmp_path, monkeypatch):
     results = Results.read(tiny.output)
     found = reproduce_paper.checkpoints_of(Part("pp-ic3net", "source"), tiny, results)
     assert found == [((0,), source)]
+
+
+def test_speed_is_measured_from_a_source_that_holds_its_seed(tiny, tmp_path, monkeypatch):
+    """Not from the first that is found, which may be of other seeds."""
+    others, ours = (tmp_path / name / "checkpoints" / "source" for name in ("others", "ours"))
+    monkeypatch.setattr(
+        reproduce_paper, "checkpoints_of", lambda *_: [((3, 4), others), ((0, 1, 2), ours)]
+    )
+    seen = {}
+
+    def timed(config, arm, epochs):
+        seen[arm] = (config.seeds, config.source_checkpoint)
+        return {"epochs": epochs, "seconds": 1.0, "standard_error": 0.1, "load_before": 0.0}
+
+    monkeypatch.setattr(paper_speed, "seconds_per_epoch", timed)
+    options = replace(tiny, experiments=("pp-ic3net",), measure_speed=True)
+    reproduce_paper.measure(options, Results.read(tiny.output))
+    assert seen == {"source": ((0,), None), "transfer": ((0,), ours)}
