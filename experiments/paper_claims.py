@@ -24,6 +24,8 @@ SOLVED = 30.0
 """Steps taken that count as success on the target: the paper's transferred policies got there."""
 AT_RANDOM = 0.9
 """Share of the step limit from which the paper's scratch row counts as a failure."""
+FALLEN_BACK = 1.5
+"""Times its best at which an arm's end is called a fall: a ratio at the hour then hangs on when."""
 LEAST_SEEDS = 3
 
 RULES = f"""\
@@ -126,6 +128,10 @@ def _why(compared: Comparison) -> str:
         for words, arm in (("transferred", compared.transfer), ("scratch", compared.scratch))
     ]
     text += f"; {SOLVED:g} steps reached by " + " and ".join(f"{n} {w} seeds" for w, n in reached)
+    for words, arm in (("transfer", compared.transfer), ("scratch", compared.scratch)):
+        best, at = arm.best
+        if (end := float(iqm(arm.last))) > FALLEN_BACK * best:
+            text += f"; {words} fell back from {best:.3g} steps at {at / 1e6:.2f} M to {end:.3g}"
     if not compared.at_the_papers_hour:
         text += f"; the budget ends at {compared.hour:.3g} of the paper's {compared.row.hours:g} h"
     return text + "."

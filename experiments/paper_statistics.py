@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from published import EXPERIMENTS, Experiment
 from scipy.stats import bootstrap, trim_mean
 
@@ -24,6 +25,8 @@ CONFIDENCE = 0.95
 RESAMPLES = 5000
 BOOTSTRAP_SEED = 0
 THRESHOLDS = (30.0, 25.0, 20.0, 15.0)
+BEST_EPOCHS = 10
+"""In a row, that an arm's best is the mean of: one epoch alone may be luck."""
 NEVER = math.inf
 
 Row = dict[str, Any]
@@ -118,6 +121,15 @@ class Arm:
     def last(self) -> Sample:
         """Mean over the last tenth of the epochs."""
         return self.filled[:, -max(1, len(self.epochs) // 10) :].mean(-1)
+
+    @property
+    def best(self) -> tuple[float, float]:
+        """The least mean of `BEST_EPOCHS` epochs in a row, and the environment steps until then."""
+        curve = iqm(self.filled, axis=0)
+        length = min(BEST_EPOCHS, len(curve))
+        means = sliding_window_view(curve, length).mean(-1)
+        first = int(means.argmin())
+        return float(means[first]), float(self.env_steps[:, first + length - 1].mean())
 
     def in_hour(self, at: float, offset: float = 0.0) -> Sample:
         """Mean over the epochs that end in the hour before `at` (the paper's section VII-C)."""

@@ -189,6 +189,13 @@ class TestClaims:
         assert self.verdicts(scratch=[[60] * 252] * 2)[q2] == IN_PART  # too few seeds
         assert self.verdicts(scratch=[[60] * 99] * 3)[q2] == IN_PART  # too short
 
+    def test_an_arm_that_falls_back_is_told_of(self):
+        jump = [100] * 120 + [30] * 12 + [100] * 120
+        rows = arms("pp-ic3net", **{**self.WHOLE, "scratch": [jump] * 3})
+        (reason,) = (c.reason for c in claims(rows, "paper") if c.name.startswith("Q2, PP, IC3Net"))
+        assert "scratch fell back from 30 steps at 2.60 M to 100" in reason
+        assert "transfer fell back" not in reason
+
     def test_upsampling_that_harms(self):
         q1 = "Q1, PP, IC3Net on the source: upsampling does no harm"
         assert self.verdicts(source=[[6] * 350] * 3)[q1] == FAILS
