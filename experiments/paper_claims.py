@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from paper_statistics import (
+    BEST_EPOCHS,
     Comparison,
     Estimate,
     Row,
@@ -46,6 +47,8 @@ RULES = f"""\
   when every transferred seed and no seed from scratch came to {SOLVED:g} steps within its budget,
   in part when more transferred seeds did; over the rows it holds when it does in all, in part when
   it does in part in any.
+* An arm "fell back" when the mean over its last tenth is over {FALLEN_BACK:g} times the least mean of
+  {BEST_EPOCHS} epochs in a row; no verdict hangs on it, but what the ratio at the hour is worth does.
 * Nothing more than "holds in part" is said with fewer than {LEAST_SEEDS} seeds, and, but for Q1,
   where the budget ends before the paper's hour: what scratch would have come to is not known then.
 """
@@ -123,12 +126,13 @@ def _why(compared: Comparison) -> str:
     best, at = compared.largest(counted=True)
     if not math.isnan(best):
         text += f", {best:.1f}x at {at / 1e6:.2f} M when the source's steps count"
+    arms = (("transferred", compared.transfer), ("scratch", compared.scratch))
     reached = [
         (words, f"{(arm.env_steps_to(SOLVED) < math.inf).sum()} of {len(arm.filled)}")
-        for words, arm in (("transferred", compared.transfer), ("scratch", compared.scratch))
+        for words, arm in arms
     ]
     text += f"; {SOLVED:g} steps reached by " + " and ".join(f"{n} {w} seeds" for w, n in reached)
-    for words, arm in (("transfer", compared.transfer), ("scratch", compared.scratch)):
+    for words, arm in arms:
         best, at = arm.best
         if (end := float(iqm(arm.last))) > FALLEN_BACK * best:
             text += f"; {words} fell back from {best:.3g} steps at {at / 1e6:.2f} M to {end:.3g}"

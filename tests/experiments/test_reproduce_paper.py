@@ -194,7 +194,7 @@ class TestClaims:
         rows = arms("pp-ic3net", **{**self.WHOLE, "scratch": [jump] * 3})
         (reason,) = (c.reason for c in claims(rows, "paper") if c.name.startswith("Q2, PP, IC3Net"))
         assert "scratch fell back from 30 steps at 2.60 M to 100" in reason
-        assert "transfer fell back" not in reason
+        assert "transferred fell back" not in reason
 
     def test_upsampling_that_harms(self):
         q1 = "Q1, PP, IC3Net on the source: upsampling does no harm"
