@@ -47,8 +47,8 @@ RULES = f"""\
   when every transferred seed and no seed from scratch came to {SOLVED:g} steps within its budget,
   in part when more transferred seeds did; over the rows it holds when it does in all, in part when
   it does in part in any.
-* An arm "fell back" when the mean over its last tenth is over {FALLEN_BACK:g} times the least mean of
-  {BEST_EPOCHS} epochs in a row; no verdict hangs on it, but what the ratio at the hour is worth does.
+* An arm "fell back" when the mean over its last tenth is over {FALLEN_BACK:g} times the least
+  mean of {BEST_EPOCHS} epochs in a row; no verdict depends on it, but its ratio is worth little.
 * Nothing more than "holds in part" is said with fewer than {LEAST_SEEDS} seeds, and, but for Q1,
   where the budget ends before the paper's hour: what scratch would have come to is not known then.
 """
