@@ -4,12 +4,12 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from paper_claims import NOT_RUN, RULES, Claim, claims, number, said
 from paper_figures import figure_2
-from paper_parts import ABLATED, FAST_SOURCE_EPOCHS, FAST_TARGET_EPOCHS, FAST_TARGET_EPOCHS_OTHERS
+from paper_parts import ABLATED, Budget, Part, PresetName, unchanged_arms
 from paper_results import Results, write_csv
 from paper_statistics import (
     STATISTICS_COLUMNS,
@@ -29,21 +29,20 @@ from published import EXPERIMENTS, SOURCES
 
 from sumajax.reporting import write_text
 
-PRESETS = ("fast", "paper")
+PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 PROVENANCE = "provenance"
 
 VARIANTS = {
-    "": "as the paper (transfer)",
-    "corner": "(a) no upsampling: small state in a corner",
-    "mass": "(b) state scale `mass`",
-    "encoder": "(c) all but the state encoder",
-    "optimiser": "(d) optimiser state carried",
-    "25": "(e) source trained 25%",
-    "50": "(e) source trained 50%",
-    "lab-gap": "(f) encoder `lab_gap`, upsampled",
-    "lab-gap-native": "(f) encoder `lab_gap`, not upsampled",
+    "transfer-corner": "(a) no upsampling: small state in a corner",
+    "transfer-mass": "(b) state scale `mass`",
+    "transfer-encoder": "(c) all but the state encoder",
+    "transfer-optimiser": "(d) optimiser state carried",
+    "transfer-25": "(e) source trained 25%",
+    "transfer-50": "(e) source trained 50%",
+    "transfer-lab-gap": "(f) encoder `lab_gap`, upsampled",
+    "transfer-lab-gap-native": "(f) encoder `lab_gap`, not upsampled",
+    "scratch-lab-gap": "(f) from scratch, encoder `lab_gap`",
 }
-SCRATCH = {"scratch": "from scratch", "scratch-lab-gap": "(f) from scratch, encoder `lab_gap`"}
 
 
 def write_report(results: Results) -> None:
@@ -242,8 +241,9 @@ def ablations(results: Results) -> list[dict[str, str]]:
     rows = []
     for preset in PRESETS:
         for name in ABLATED:
-            arms = {f"transfer-{v}" if v else "transfer": text for v, text in VARIANTS.items()}
-            for arm, text in (arms | SCRATCH).items():
+            transfer, scratch = unchanged_arms(name, preset)
+            unchanged = {transfer.arm: "as the paper (transfer)", scratch.arm: "from scratch"}
+            for arm, text in (unchanged | VARIANTS).items():
                 there = (name, arm, preset) in kept
                 if not there and preset not in presets(results):
                     continue
@@ -342,7 +342,6 @@ def _budgets(results: Results, known: Iterable[str]) -> str:
     """Epochs per arm: the paper's, those of `fast`, and those that the kept curves have."""
     rows = []
     for name, row in EXPERIMENTS.items():
-        fast_target = FAST_TARGET_EPOCHS.get(name, FAST_TARGET_EPOCHS_OTHERS)
         for arm, epochs in row.epochs.items():
             if arm.startswith("source") and name not in SOURCES:
                 continue
@@ -352,7 +351,7 @@ def _budgets(results: Results, known: Iterable[str]) -> str:
                     "experiment": row.title,
                     "arm": arm,
                     "preset paper": epochs,
-                    "preset fast": FAST_SOURCE_EPOCHS if "source" in arm else fast_target,
+                    "preset fast": Budget("fast").epochs(Part(name, arm)),
                     "kept": "; ".join(_kept(*item) for item in kept.items() if item[1]) or NOT_RUN,
                 }
             )

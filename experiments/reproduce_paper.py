@@ -164,7 +164,7 @@ def locked(directory: Path) -> Any:
 
 def train(options: Options, results: Results) -> None:
     """Runs what is missing of the chosen parts, and keeps each part when it ends."""
-    parts = parts_of(options.experiments)
+    parts = parts_of(options.experiments, options.preset)
     missing = {part: missing_seeds(part, options, results) for part in parts}
     for part in parts:
         needed = missing[part] | _needed_by(part, missing, options, results)
@@ -310,7 +310,7 @@ def measure(options: Options, results: Results) -> None:
     from paper_speed import seconds_per_epoch
 
     seeds = (SPEED_SEED,)
-    for part in parts_of(options.experiments):
+    for part in parts_of(options.experiments, options.preset):
         if part.changes or part.share != 1:
             continue
         start = None

@@ -15,7 +15,7 @@ import pytest
 import reproduce_paper
 import transfer_run
 from paper_claims import FAILS, HOLDS, IN_PART, NOT_RUN, claims, number, said
-from paper_parts import SELECTIONS, Budget, Part, config_of, parts_of
+from paper_parts import SELECTIONS, Budget, Part, config_of, parts_of, unchanged_arms
 from paper_report import on_the_way, report, statistics_rows, table_1, table_2
 from paper_results import Results, recognised
 from paper_statistics import (
@@ -212,14 +212,14 @@ class TestClaims:
 
 def test_every_selection_has_parts_in_order():
     for selection in SELECTIONS:
-        parts = parts_of([selection])
+        parts = parts_of([selection], "fast")
         before = set()
         for part in parts:
             assert part.source is None or part.source in before
             before.add((part.experiment, part.arm))
-    everything = parts_of(SELECTIONS)
+    everything = parts_of(SELECTIONS, "fast")
     assert len({(part.experiment, part.arm) for part in everything}) == len(everything)
-    assert Part("pcp-hetnet-2p1c", "source") in parts_of(["pcp-hetnet-3p2c"])
+    assert Part("pcp-hetnet-2p1c", "source") in parts_of(["pcp-hetnet-3p2c"], "fast")
 
 
 def test_budgets_of_parts():
@@ -228,13 +228,24 @@ def test_budgets_of_parts():
     assert (fast.epochs(scratch), paper.epochs(scratch)) == (125, 252)
     assert Budget("paper", scale=0.1).epochs(scratch) == 25
     assert Budget("paper", target=7).epochs(scratch) == 7
-    assert fast.epochs(Part("pp-hetnet", "transfer", "source")) == 60
+    assert fast.epochs(Part("pp-hetnet", "transfer", "source")) == 150
+    assert fast.epochs(Part("pp-hetnet", "transfer-mass", "source-mass")) == 60
     assert fast.epochs(Part("pp-hetnet", "source-25", share=0.25)) == 12
+
+
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_an_ablation_is_compared_with_an_unchanged_arm_of_its_budget(preset):
+    budget = Budget(preset)
+    for part in parts_of(["encoder", "mass"], preset):
+        if part.stage == "transfer":
+            unchanged, _ = unchanged_arms(part.experiment, preset)
+            assert unchanged in parts_of(["encoder"], preset)
+            assert budget.epochs(part) == budget.epochs(unchanged)
 
 
 @pytest.mark.parametrize("selection", SELECTIONS)
 def test_every_part_is_a_run_that_is_accepted(selection, tmp_path):
-    for part in parts_of([selection]):
+    for part in parts_of([selection], "fast"):
         config = config_of(part, Budget("fast"), (0, 1), tmp_path / "run", None, 1)
         stage = transfer_run.Run.of(config).stage(part.stage)
         assert stage.epochs == Budget("fast").epochs(part)
@@ -411,7 +422,7 @@ def test_the_kept_results_are_what_their_files_say(tmp_path):
 @pytest.mark.slow
 def test_a_part_that_was_stopped_goes_on_and_its_rows_are_kept(tiny, monkeypatch):
     parts = [Part("pp-ic3net", "source"), Part("pp-ic3net", "transfer", "source")]
-    monkeypatch.setattr(reproduce_paper, "parts_of", lambda selections: parts)
+    monkeypatch.setattr(reproduce_paper, "parts_of", lambda *chosen: parts)
     with stopped_in("transfer", KeyboardInterrupt):
         run(tiny)
     assert [row["arm"] for row in Results.read(tiny.output).rows["curves"]] == ["source"]
