@@ -1,16 +1,32 @@
 """Compiling is most of what the tests do: compile little, and nothing twice."""
 
+import mmap
 import os
+from importlib.util import find_spec
+from pathlib import Path
 
-# The compiler's least effort: what is checked here is what programs compute, not how fast.
-os.environ["XLA_FLAGS"] = (
-    os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
-).strip()
+LEAST_EFFORT = ("xla_backend_optimization_level=0", "xla_cpu_use_fusion_emitters=false")
+"""What is checked here is what programs compute, not how fast: with both flags HetNet's update is
+compiled in a quarter of the time that the first alone takes."""
 
-import jax
+
+def known(flag: str) -> bool:
+    """Whether this jaxlib has a flag: XLA ends the process at one that it does not know."""
+    name = flag.split("=")[0].encode()
+    for library in Path(find_spec("jaxlib").origin).parent.glob("*jax_common*"):
+        with open(library, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as m:
+            if m.find(name) >= 0:
+                return True
+    return False
+
+
+flags = [f"--{flag}" for flag in LEAST_EFFORT if known(flag)]
+os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
 
 
 def pytest_configure(config):
     """Compiled programs are shared by the tests of a run, its worker processes and later runs."""
+    import jax  # after its flags
+
     jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -120,6 +120,6 @@ def test_the_published_procedure():
     """Preset `paper`: whole episodes, no discount, RMSprop."""
     probes = LastStepReward(), MatchView()
     small = {"num_envs": 25, "rollout_length": 4, "learning_rate": 1e-2}
-    value, action = learn(*probes, policy="iric", epochs=3, settings="paper", **small)
+    value, action = learn(*probes, policy="iric", epochs=4, settings="paper", **small)
     np.testing.assert_allclose(values_by_step(value, probes[0]), 1, atol=0.1)
     assert (earned(action) > ALWAYS).all()
