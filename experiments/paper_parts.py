@@ -42,7 +42,8 @@ FAST_TARGET_EPOCHS = {"pp-ic3net": 125, "pp-magic": 60}
 FAST_TARGET_EPOCHS_OTHERS = 150
 FAST_BRIEF_EPOCHS = {"pp-hetnet": 60}
 """Of preset `fast`: 1.0 M source steps; on the target 3.0 M for HetNet, 2.5 M for IC3Net and 1.2 M
-for MAGIC, of which every seed has learnt by then. The many ablations of HetNet are brief: 1.2 M."""
+for MAGIC, by when all of their seeds have come to 20 steps. HetNet's many ablations are brief:
+1.2 M."""
 
 ABLATED = ("pp-ic3net", "pp-hetnet")
 """Experiments that the ablations change."""
@@ -115,7 +116,10 @@ def unchanged_arms(name: str, preset_name: PresetName) -> tuple[Part, Part]:
 
 
 def ablation(selection: str, name: str, preset_name: PresetName) -> list[Part]:
-    """The parts of one ablation of an experiment; the arms it is compared with included."""
+    """The parts of one ablation of an experiment; the arms it is compared with included.
+
+    `lab-gap`, another encoder, is compared with arms of its own.
+    """
     unchanged = (Part(name, "source"), *unchanged_arms(name, preset_name))
     on_target: dict[str, Changes] = {
         "encoder": (("leave_out", ("state_encoder",)),),
