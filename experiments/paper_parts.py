@@ -13,8 +13,8 @@ from typing import Any, Literal, get_args
 from pcp_transfer import PCPTransfer
 from pp_transfer import PPTransfer
 from published import EXPERIMENTS, SOURCES, Experiment
-from transfer_config import SOURCE, TRANSFER, TransferConfig
 
+from sumajax.cli.transfer_config import SOURCE, TRANSFER, TransferConfig
 from sumajax.environments import PredatorPrey
 from sumajax.learning import parallel, preset
 

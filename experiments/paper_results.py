@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from published import EXPERIMENTS
-from transfer_config import SCRATCH, SOURCE, TRANSFER
 
+from sumajax.cli.transfer_config import SCRATCH, SOURCE, TRANSFER
 from sumajax.learning import preset
 from sumajax.reporting import metrics as metrics_file
 

@@ -7,9 +7,9 @@ from statistics import mean, stdev
 from typing import Any
 
 import jax
-from transfer_config import SOURCE, TransferConfig
-from transfer_run import Run
 
+from sumajax.cli.transfer_config import SOURCE, TransferConfig
+from sumajax.experiment.run import Run
 from sumajax.learning import parallel
 from sumajax.transfer import fresh_states, transferred_states
 

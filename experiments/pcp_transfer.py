@@ -7,9 +7,8 @@ python experiments/pcp_transfer.py --target.num-predators 2 --target.num-capture
 from dataclasses import dataclass
 from typing import ClassVar
 
-from command_line import main
-from transfer_config import TransferConfig
-
+from sumajax.cli.command_line import main
+from sumajax.cli.transfer_config import TransferConfig
 from sumajax.environments import PredatorCapturePrey
 
 

@@ -7,9 +7,8 @@ python experiments/pp_transfer.py --policy commnet --seeds 0 1 2 --output runs/m
 from dataclasses import dataclass
 from typing import ClassVar
 
-from command_line import main
-from transfer_config import TransferConfig
-
+from sumajax.cli.command_line import main
+from sumajax.cli.transfer_config import TransferConfig
 from sumajax.environments import PredatorPrey
 
 

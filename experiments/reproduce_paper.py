@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from command_line import parse, plain_errors, prepare_jax
 from filelock import FileLock, Timeout
 from paper_parts import (
     SELECTIONS,
@@ -41,11 +40,12 @@ from paper_results import (
     machine,
     recognised,
 )
-from run_directory import versions
-from transfer_config import MAX_DEVICES, MAX_EPOCHS, SOURCE, check_seeds
-from transfer_run import run_experiment
 
 from sumajax import checkpoint
+from sumajax.cli.command_line import parse, plain_errors, prepare_jax
+from sumajax.cli.transfer_config import MAX_DEVICES, MAX_EPOCHS, SOURCE, check_seeds
+from sumajax.experiment.directory import versions
+from sumajax.experiment.run import run_experiment
 from sumajax.reporting import write_json
 from sumajax.transfer import StoppedError
 

@@ -20,13 +20,13 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 
-import command_line
 import matplotlib.pyplot  # noqa: F401
-import transfer_run
 from orbax.checkpoint import v1  # noqa: F401
 from pp_transfer import PPTransfer
 
 from sumajax import evaluate
+from sumajax.cli import command_line
+from sumajax.experiment import run as transfer_run
 from sumajax.policies import make_policy
 from sumajax.transfer import run_stage
 

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-import transfer_run
+
+from sumajax.experiment import run as transfer_run
 
 
 @contextmanager

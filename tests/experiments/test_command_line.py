@@ -6,7 +6,6 @@ import sys
 import time
 from pathlib import Path
 
-import command_line
 import jax
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from pcp_transfer import PCPTransfer
 from pp_transfer import PPTransfer
 
 from sumajax import checkpoint
+from sumajax.cli import command_line
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import LearnerConfig, make_learner
 from sumajax.policies import make_policy
@@ -284,7 +284,7 @@ def test_a_mistake_gets_one_sentence(
 
 def test_the_program_itself_ends_with_status_2(there, tmp_path):
     """The same as a person sees it: a process, its status and what it prints."""
-    program = Path(command_line.__file__).with_name("pp_transfer.py")
+    program = Path(__file__).parents[2] / "experiments" / "pp_transfer.py"
     rows = {
         "--devices 7 --learner.num-envs 100": f"100 environments {UNSHARED} 7 devices",
         "--source-checkpoint @truncated": SOURCES["truncated"],

@@ -4,12 +4,12 @@ import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import command_line
 import pytest
-from config_file import with_config_file
 from pcp_transfer import PCPTransfer
 from pp_transfer import PPTransfer
 
+from sumajax.cli import command_line
+from sumajax.cli.config_file import with_config_file
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import preset
 

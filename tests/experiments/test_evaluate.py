@@ -3,7 +3,7 @@
 import json
 import sys
 
-import evaluate as program
+from sumajax.cli import evaluate as program
 import jax
 import numpy as np
 import pytest

@@ -5,7 +5,8 @@ import os
 
 import pytest
 from pp_transfer import PPTransfer
-from run_directory import claimed
+
+from sumajax.experiment.directory import claimed
 
 HERE = "127.0.0.1:1234"
 

@@ -4,7 +4,8 @@ import signal
 import threading
 
 import pytest
-from interrupt import ASKED, stop_when_asked
+
+from sumajax.experiment.interrupt import ASKED, stop_when_asked
 
 
 def test_the_first_is_noted_and_the_second_stops():

@@ -13,7 +13,6 @@ import paper_results
 import paper_speed
 import pytest
 import reproduce_paper
-import transfer_run
 from paper_claims import FAILS, HOLDS, IN_PART, NOT_RUN, claims, number, said
 from paper_parts import SELECTIONS, Budget, Part, config_of, parts_of, unchanged_arms
 from paper_report import on_the_way, report, statistics_rows, table_1, table_2
@@ -30,11 +29,12 @@ from paper_statistics import (
 )
 from published import EXPERIMENTS, SOURCES
 from reproduce_paper import Options, run
-from run_directory import plain
 from stopping import stopped_in
 
 from sumajax import checkpoint, evaluate
 from sumajax.environments import PredatorPrey
+from sumajax.experiment import run as transfer_run
+from sumajax.experiment.directory import plain
 from sumajax.learning import LearnerConfig
 from sumajax.policies import make_policy
 from sumajax.transfer import StoppedError

@@ -10,13 +10,13 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-import transfer_run
 from pp_transfer import PPTransfer
-from run_directory import claimed
 from stopping import stopped_in
 
 from sumajax import evaluate, load_agent
 from sumajax.environments import PredatorPrey
+from sumajax.experiment import run as transfer_run
+from sumajax.experiment.directory import claimed
 from sumajax.learning import LearnerConfig
 from sumajax.policies import make_policy
 

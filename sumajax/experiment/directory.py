@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from transfer_config import WHERE, TransferConfig
 
 from sumajax import reporting
+from sumajax.cli.transfer_config import WHERE, TransferConfig
 
 
 @contextmanager

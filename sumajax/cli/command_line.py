@@ -14,11 +14,11 @@ from typing import Any, TypeVar, get_type_hints
 
 import jax
 import tyro
-from config_file import NOTE, with_config_file
-from transfer_config import TransferConfig
-from transfer_run import run_experiment
 
 from sumajax import hosts
+from sumajax.cli.config_file import NOTE, with_config_file
+from sumajax.cli.transfer_config import TransferConfig
+from sumajax.experiment.run import run_experiment
 from sumajax.learning import parallel, preset
 
 CACHE = Path.home() / ".cache" / "sumajax" / "compiled"

@@ -10,17 +10,17 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import evaluations_file
 import jax
 import numpy as np
-from interrupt import stop_when_asked
 from jax.sharding import Mesh
-from run_directory import claimed, described, plain
-from transfer_config import SCRATCH, SOURCE, TRANSFER, TransferConfig
 
 from sumajax import checkpoint, hosts, reporting
+from sumajax.cli.transfer_config import SCRATCH, SOURCE, TRANSFER, TransferConfig
 from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES, evaluate, evaluate_random, shortest_path_steps
+from sumajax.experiment import evaluations_file
+from sumajax.experiment.directory import claimed, described, plain
+from sumajax.experiment.interrupt import stop_when_asked
 from sumajax.learning import EPOCH_STEPS, TrainState, make_learner, parallel
 from sumajax.policies import Policy, make_policy
 from sumajax.reporting import metrics as metrics_file
