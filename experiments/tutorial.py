@@ -25,7 +25,7 @@ from sumajax import PredatorPrey, StateUpsampled, evaluate, load_agent, make_lea
 from sumajax.environments.types import Environment
 from sumajax.evaluation import evaluate_random, shortest_path_steps
 from sumajax.reporting import learning_curves, record_episode, rows_of, write_gif, write_strip
-from sumajax.transfer import Chunk, Stage, fresh_states, run_stage, transferred_states
+from sumajax.transfer import Chunk, StageRun, fresh_states, run_stage, transferred_states
 
 OUTPUT = Path("runs") / time.strftime("tutorial-%Y%m%d-%H%M%S")
 OUTPUT.mkdir(parents=True)
@@ -71,13 +71,13 @@ EPOCHS = 15
 rows: list[dict] = []
 
 
-def stage_of(arm: str, env: Environment) -> Stage:
+def stage_of(arm: str, env: Environment) -> StageRun:
     """IC3Net on `env` with the settings of the preset `fast`."""
     learner = make_learner(env, make_policy("ic3net", env))
-    return Stage(arm, learner, EPOCHS, seeds=(0,), directory=OUTPUT / "checkpoints" / arm)
+    return StageRun(arm, learner, EPOCHS, seeds=(0,), directory=OUTPUT / "checkpoints" / arm)
 
 
-def follow(stage: Stage) -> Callable[[Chunk], None]:
+def follow(stage: StageRun) -> Callable[[Chunk], None]:
     """Prints the last epoch of each chunk and keeps all of them for the curves."""
 
     def on_chunk(chunk: Chunk) -> None:

@@ -4,6 +4,7 @@
 and `check_compatible` says whether the parameters fit another stage.
 """
 
+import contextlib
 import dataclasses
 import importlib.metadata
 import math
@@ -43,7 +44,7 @@ def describe(env: Environment, policy: Policy, **more: Any) -> dict[str, Any]:
     """
     cls = type(policy.module)
     return {
-        "task": _describe_task(env),
+        "task": describe_task(env),
         "policy": {
             "name": policy.name,
             "module": _class_name(
@@ -66,20 +67,38 @@ def rebuild(meta: dict[str, Any]) -> tuple[Environment, Policy]:
     Raises:
       CheckpointError: for a task or policy that is not one of those, or a value it refuses.
     """
-    try:
-        env = _rebuild_task(meta["task"])
+    env = rebuild_task(meta)
+    return env, rebuild_policy(meta, env)
+
+
+def rebuild_task(meta: dict[str, Any]) -> Environment:
+    """The task of `meta`; errors as for `rebuild`."""
+    with _unusable():
+        return _rebuild_task(meta["task"])
+
+
+def rebuild_policy(meta: dict[str, Any], env: Environment) -> Policy:
+    """The policy of `meta`, shaped for `env`; errors as for `rebuild`."""
+    with _unusable():
         name, settings = meta["policy"]["name"], meta["policy"]["settings"]
         if name not in POLICIES or POLICIES[name][0].__name__ != meta["policy"]["module"]:
             raise CheckpointError(
                 f"policy {name!r} is not one of {', '.join(POLICIES)}; build it in your program "
-                "and take its parameters with load_params."
+                "and give it to load_agent as policy=..., or take its parameters with load_params."
             )
         settings = _bounded(settings)
         policy = make_policy(name, env, **settings)
         for field in dataclasses.fields(policy.module):
             if field.name in settings and not _fits(settings[field.name], field.default):
                 raise ValueError(f"policy setting {field.name} is {settings[field.name]!r}")
-        return env, policy
+        return policy
+
+
+@contextlib.contextmanager
+def _unusable() -> Iterator[None]:
+    """Whatever a description that is not ours makes go wrong, in one sentence."""
+    try:
+        yield
     except CheckpointError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
@@ -163,7 +182,8 @@ def _sides(state_shape: Any) -> str:
     return f"{state_shape[1]}x{state_shape[2]}"
 
 
-def _describe_task(env: Any) -> dict[str, Any]:
+def describe_task(env: Any) -> dict[str, Any]:
+    """A task as JSON: its class, and the fields of its configuration."""
     fields = dataclasses.fields(env) if dataclasses.is_dataclass(env) else ()
     return {
         "class": _class_name(type(env), TASKS),
@@ -188,7 +208,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     if type(value) in TASKS.values():
-        return _describe_task(value)
+        return describe_task(value)
     return _class_name(value if hasattr(value, "__qualname__") else type(value), {})
 
 
@@ -204,8 +224,8 @@ def _rebuild_task(task: dict[str, Any], depth: int = 0) -> Environment:
     name, fields = task["class"], _bounded(task["fields"])
     if not isinstance(name, str) or name not in TASKS or depth > 4:
         raise CheckpointError(
-            f"task {name!r} is not one of {', '.join(TASKS)}; build it in your program and take "
-            "the policy's parameters with load_params."
+            f"task {name!r} is not one of {', '.join(TASKS)}; build it in your program and give it "
+            "to load_agent as env=..., or take the policy's parameters with load_params."
         )
     if "env" in fields:
         fields["env"] = _rebuild_task(fields["env"], depth + 1)

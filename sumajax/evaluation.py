@@ -13,9 +13,11 @@ from flax import struct
 
 from sumajax import checkpoint
 from sumajax.checkpoint import CheckpointError
+from sumajax.description import rebuild_policy, rebuild_task
 from sumajax.environments.types import Environment, Observation
 from sumajax.learning.rollout import Actors, act, select, start, state_features
 from sumajax.policies.types import Policy
+from sumajax.transfer import checkpoints_of
 
 HELD_OUT_SEED = 20_240_229
 """Of the held-out starts; training keys are folded from small seeds, never from this."""
@@ -167,33 +169,51 @@ class Agent:
         return carry, output.action
 
 
-ARMS = ("transfer", "scratch", "source")
-"""Where a run's directory is given: the arm whose policy is meant, first found."""
-
-
-def load_agent(directory: str | os.PathLike[str], *, seed: int = 0) -> Agent:
-    """The policy that a run, or one arm's checkpoint directory, ended with.
+def load_agent(
+    directory: str | os.PathLike[str],
+    *,
+    seed: int | None = None,
+    env: Environment | None = None,
+    policy: Policy | None = None,
+) -> Agent:
+    """The policy that a run, or one stage of it, ended with.
 
     Args:
-      directory: of a run (its transferred policy is taken), of its checkpoints/<arm>, or of one
-        checkpoint.
-      seed: which of the seeds trained side by side, by position.
+      directory: of a run (the policy of its last stage is taken), of one of its
+        checkpoints/<stage>, or of one checkpoint.
+      seed: which of the seeds that were trained side by side; None: the first.
+      env, policy: what it was trained on and as, where the package does not know them.
 
     Raises:
-      CheckpointError: when there is no good checkpoint, or it does not say what it is of.
+      CheckpointError: when there is no good checkpoint, it has not that seed, or it is of a task or
+        policy that the package does not know, or of another than was given.
     """
-    root = Path(directory)
-    arms = [root / "checkpoints" / arm for arm in ARMS if (root / "checkpoints" / arm).is_dir()]
-    root = arms[0] if arms else root
+    root = checkpoints_of(Path(directory))
     meta = checkpoint.read_meta(root)
-    env, policy = checkpoint.rebuild(meta)
-    num_seeds = len(meta.get("seeds", ()))
+    if env is None and policy is None:
+        env, policy = checkpoint.rebuild(meta)
+    else:
+        env, policy = _given(meta, env, policy)
+        checkpoint.check_compatible(meta, env, policy, root)
     like = jax.eval_shape(policy.init, jax.random.key(0))
-    if num_seeds:
-        if not 0 <= seed < num_seeds:
-            raise CheckpointError(f"{root} holds {num_seeds} seeds; there is no seed {seed}.")
-        stacked = jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_seeds, *x.shape), x.dtype), like)
-        params = jax.tree.map(lambda x: x[seed], checkpoint.load_params(root, stacked))
+    seeds = meta.get("seeds", [])
+    if seed is not None and seed not in (seeds or [0]):
+        raise CheckpointError(f"{root} holds seeds {seeds or [0]}, not {seed}.")
+    if seeds:
+        place = 0 if seed is None else seeds.index(seed)
+        stacked = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((len(seeds), *x.shape), x.dtype), like
+        )
+        params = jax.tree.map(lambda x: x[place], checkpoint.load_params(root, stacked))
     else:
         params = checkpoint.load_params(root, like)
     return Agent(env, policy, jax.tree.map(jnp.asarray, params))
+
+
+def _given(
+    meta: dict[str, Any], env: Environment | None, policy: Policy | None
+) -> tuple[Environment, Policy]:
+    """The task and policy that were given, and of what was not, the checkpoint's."""
+    env = rebuild_task(meta) if env is None else env
+    policy = rebuild_policy(meta, env) if policy is None else policy.shaped_for(env)
+    return env, policy

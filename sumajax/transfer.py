@@ -21,18 +21,18 @@ from sumajax import checkpoint, hosts
 from sumajax.checkpoint import CheckpointError
 from sumajax.learning import parallel
 from sumajax.learning.guard import FAULTS
-from sumajax.learning.learner import Learner, Metrics, TrainState, make_learner
+from sumajax.learning.learner import Learner, Metrics, TrainState
 
 CHUNK = 5
 """Epochs of a compiled call: between two looks at the metrics, and between two checkpoints."""
 
 
 @dataclass(frozen=True)
-class Stage:
-    """What is to be trained.
+class StageRun:
+    """A stage of training, ready to run.
 
     Attributes:
-      arm: its name in the files: `source`, `transfer` or `scratch`.
+      arm: its name in the files.
       directory: of its checkpoints.
     """
 
@@ -83,15 +83,39 @@ class Chunk:
     metrics: Metrics  # leaves (seeds, epochs of the chunk)
     seconds: float  # wall time of the chunk
     compile_seconds: float = 0.0  # before it
+    cpu_seconds: float = 0.0  # user and system time of the process since the stage began
 
 
-def fresh_states(stage: Stage) -> TrainState:
+def stage_directories(run: Path) -> dict[str, Path]:
+    """Where the checkpoints of each stage of a run lie, by its name; the stage that comes after
+    most others, the run's target where it has been reached, stands first.
+
+    Empty for what is no directory of a run.
+    """
+    folder = run / "checkpoints"
+    names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    found = {name: folder / name for name in names if checkpoint.latest(folder / name) is not None}
+    follows = {name: _follows(checkpoint.read_meta(path)) for name, path in found.items()}
+    return {name: found[name] for name in sorted(found, key=lambda name: -len(follows[name]))}
+
+
+def _follows(meta: dict[str, Any]) -> list[str]:
+    """The stages that a stage comes from; before they were recorded only `transfer` had one."""
+    return meta.get("follows", ["source"] if meta.get("arm") == "transfer" else [])
+
+
+def checkpoints_of(directory: Path) -> Path:
+    """`directory`, or of a run the one of its last stage's checkpoints."""
+    return next(iter(stage_directories(directory).values()), directory)
+
+
+def fresh_states(stage: StageRun) -> TrainState:
     """Untrained states, stacked over the stage's seeds."""
     return parallel.init_seeds(stage.learner, list(stage.seeds))
 
 
 def transferred_states(
-    stage: Stage,
+    stage: StageRun,
     source: Path,
     *,
     carry_optimiser: bool = False,
@@ -100,10 +124,11 @@ def transferred_states(
     """States that start from the parameters in the checkpoints of another stage.
 
     Everything else, memory and environments included, is fresh; the optimiser's memory too unless
-    `carry_optimiser`. A seed starts from the source's seed of that number; where the source has not
-    all of them, seed i starts from its i-th, or all from its only one.
+    `carry_optimiser`. A seed starts from the source's seed of that number, or all from its only
+    one.
 
     Args:
+      source: of the stage's checkpoints, or of a run, whose last stage is meant.
       leave_out: modules of the policy whose parameters stay fresh, as `state_encoder`.
 
     Raises:
@@ -137,21 +162,22 @@ def _without(params: Any, fresh: Any, modules: tuple[str, ...]) -> Any:
     )
 
 
-def saved_parts(stage: Stage, source: Path, *, carry_optimiser: bool = False) -> dict[str, Any]:
+def saved_parts(stage: StageRun, source: Path, *, carry_optimiser: bool = False) -> dict[str, Any]:
     """What `stage` would take over from `source`, by field of its states; compiles nothing.
 
     Raises:
       CheckpointError: when there is no good checkpoint, or it does not fit: the sentence names the
         setting or the leaf and both values.
     """
+    source = checkpoints_of(source)
     learner, meta = stage.learner, checkpoint.read_meta(source)
     checkpoint.check_compatible(meta, learner.env, learner.policy, source)
     saved_seeds = meta.get("seeds", [0])
     by_number = set(stage.seeds) <= set(saved_seeds)
-    if not by_number and len(saved_seeds) not in (1, len(stage.seeds)):
+    if not by_number and len(saved_seeds) != 1:
         raise CheckpointError(
-            f"{source} holds {len(saved_seeds)} seeds, this stage has {len(stage.seeds)}; train as "
-            "many, or transfer from one seed."
+            f"{source} holds seeds {saved_seeds}, this stage has {list(stage.seeds)}; give seeds "
+            "that it holds, or checkpoints of one seed."
         )
     like = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((len(saved_seeds), *x.shape[1:]), x.dtype),
@@ -168,23 +194,22 @@ def saved_parts(stage: Stage, source: Path, *, carry_optimiser: bool = False) ->
 
 
 def untrained_parameters(
-    source: Path, params: Any, seeds: tuple[int, ...] | None = None
+    source: Path, learner: Learner, params: Any, seeds: tuple[int, ...]
 ) -> list[str]:
     """Names of the parameters that training the source left as they were first drawn.
 
     A team of two predators and one capture agent has nobody to train what passes between two
     capture agents, and where there is one sender an attention weight is 1 whatever its parameters:
-    they enter the target stage as random as they began (algorithms.md 5.5).
+    they enter the target stage as random as they began.
 
     Args:
+      learner: of the source, or another of the same policy: the first draw depends on nothing else.
       params: what was transferred from `source`, leaves (seeds, ...).
       seeds: whose they are, where they may be some of the source's.
     """
-    meta = checkpoint.read_meta(source)
-    learner = make_learner(*checkpoint.rebuild(meta))
-    saved_seeds = meta.get("seeds", [0])
-    by_number = seeds is not None and set(seeds) <= set(saved_seeds)
-    drawn = parallel.init_seeds(learner, list(seeds if by_number and seeds else saved_seeds)).params
+    saved_seeds = checkpoint.read_meta(checkpoints_of(source)).get("seeds", [0])
+    by_number = set(seeds) <= set(saved_seeds)
+    drawn = parallel.init_seeds(learner, list(seeds if by_number else saved_seeds)).params
     pairs = zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(drawn), strict=True)
     return [
         "/".join(str(key.key) for key in path)
@@ -194,7 +219,7 @@ def untrained_parameters(
 
 
 def run_stage(
-    stage: Stage,
+    stage: StageRun,
     start: Callable[[], TrainState],
     *,
     mesh: Mesh | None = None,
@@ -223,6 +248,7 @@ def run_stage(
       StoppedError: when the last seed has stopped; its checkpoint is written.
       HostError: on the other hosts, what went wrong on the first.
     """
+    began = time.process_time()
     num_seeds, num_envs = len(stage.seeds), stage.learner.config.num_envs
     mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
     about: dict[str, Any] = {"arm": stage.arm, "seeds": list(stage.seeds), **(meta or {})}
@@ -234,6 +260,7 @@ def run_stage(
     compile_seconds = train_seconds = 0.0
     chunks = _chunks(stage, mesh, states, first_epoch, chunk)
     while len(stops) < num_seeds and (news := next(chunks, None)) is not None:
+        news = replace(news, cpu_seconds=time.process_time() - began)
         whole = news.states
         compile_seconds += news.compile_seconds
         train_seconds += news.seconds
@@ -253,7 +280,7 @@ def run_stage(
 
 
 def _begin(
-    stage: Stage, start: Callable[[], TrainState], description: dict[str, Any]
+    stage: StageRun, start: Callable[[], TrainState], description: dict[str, Any]
 ) -> tuple[int, tuple[Stop, ...], TrainState]:
     """The epoch that the stage goes on from, which seeds had stopped, and its states.
 
@@ -268,7 +295,7 @@ def _begin(
 
 
 def _save(
-    stage: Stage,
+    stage: StageRun,
     states: TrainState,
     meta: dict[str, Any],
     stop_asked: Callable[[], bool] = lambda: False,
@@ -279,7 +306,7 @@ def _save(
 
 
 def _chunks(
-    stage: Stage, mesh: Mesh, states: TrainState, first_epoch: int, longest: int
+    stage: StageRun, mesh: Mesh, states: TrainState, first_epoch: int, longest: int
 ) -> Iterator[Chunk]:
     """Trains from `first_epoch` to the stage's end; compiles when the first chunk is asked for."""
     length = _chunk_length(stage.epochs, first_epoch, longest)
@@ -296,7 +323,7 @@ def _chunks(
         yield Chunk(epoch, epoch + length, whole, jax.device_get(news), seconds, compiled - began)
 
 
-def _new_stops(stage: Stage, news: Chunk, known: tuple[Stop, ...]) -> list[Stop]:
+def _new_stops(stage: StageRun, news: Chunk, known: tuple[Stop, ...]) -> list[Stop]:
     """Seeds that have stopped; the number of updates they have taken says when."""
     stopped = {stop.seed for stop in known}
     faults, updates = np.asarray(news.metrics.fault), np.asarray(news.states.updates)
@@ -311,7 +338,7 @@ def _new_stops(stage: Stage, news: Chunk, known: tuple[Stop, ...]) -> list[Stop]
     ]
 
 
-def saved_epoch(stage: Stage) -> int:
+def saved_epoch(stage: StageRun) -> int:
     """The epoch that the stage would go on from."""
     if checkpoint.latest(stage.directory) is None:
         return 0
@@ -319,7 +346,7 @@ def saved_epoch(stage: Stage) -> int:
 
 
 def _resumed(
-    stage: Stage, start: Callable[[], TrainState]
+    stage: StageRun, start: Callable[[], TrainState]
 ) -> tuple[tuple[bool, int, list[dict[str, Any]]], TrainState]:
     """Whether the stage is new, the epoch it goes on from, which seeds had stopped; its states."""
     if checkpoint.latest(stage.directory) is None:

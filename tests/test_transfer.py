@@ -15,7 +15,7 @@ from sumajax.learning.guard import FAULTS
 from sumajax.learning.learner import Metrics
 from sumajax.policies import make_policy
 from sumajax.transfer import (
-    Stage,
+    StageRun,
     Stop,
     StoppedError,
     _chunk_length,
@@ -33,7 +33,7 @@ CONFIG = LearnerConfig(num_envs=100, rollout_length=20)
 
 def stage(env, directory, seeds=(0, 1), epochs=1, **settings):
     policy = make_policy("ic3net", env, **{"hidden": 8, **settings})
-    return Stage("source", make_learner(env, policy, CONFIG), epochs, seeds, directory)
+    return StageRun("source", make_learner(env, policy, CONFIG), epochs, seeds, directory)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_some_of_the_sources_seeds_go_on_by_their_number(source, tmp_path):
     states = transferred_states(stage(TARGET, tmp_path, seeds=(1,)), trained.directory)
     second = jax.tree.map(lambda x: x[1:], result.states.params)
     assert equal(states.params, second)
-    assert untrained_parameters(trained.directory, states.params, (1,)) == []
+    assert untrained_parameters(trained.directory, trained.learner, states.params, (1,)) == []
 
 
 def test_modules_that_are_left_out_stay_fresh(source, tmp_path):
@@ -101,9 +101,11 @@ def test_modules_that_are_left_out_stay_fresh(source, tmp_path):
         transferred_states(target, trained.directory, leave_out=("ear",))
 
 
-def test_other_numbers_of_seeds_are_refused(source, tmp_path):
-    with pytest.raises(CheckpointError, match="holds 2 seeds, this stage has 3"):
-        transferred_states(stage(TARGET, tmp_path, seeds=(0, 1, 2)), source[0].directory)
+@pytest.mark.parametrize("seeds", [(0, 1, 2), (1, 2), (5,)])
+def test_seeds_that_the_source_has_not_are_refused(source, tmp_path, seeds):
+    """Taken by their position, they would start from another seed's policy without a word."""
+    with pytest.raises(CheckpointError, match=r"holds seeds \[0, 1\], this stage has"):
+        transferred_states(stage(TARGET, tmp_path, seeds=seeds), source[0].directory)
 
 
 @pytest.mark.parametrize(
@@ -230,16 +232,19 @@ def test_a_stop_that_is_asked_for_comes_after_a_checkpoint(tmp_path, monkeypatch
 class TestUntrainedParameters:
     def test_all_have_been_trained_where_the_team_uses_all(self, source):
         stage, result = source
-        assert untrained_parameters(stage.directory, result.states.params) == []
+        assert (
+            untrained_parameters(stage.directory, stage.learner, result.states.params, stage.seeds)
+            == []
+        )
 
     @pytest.mark.slow  # compiles HetNet's learner
     def test_what_passes_between_capture_agents_waits_for_a_second_one(self, tmp_path, monkeypatch):
         monkeypatch.setattr(config, "EPOCH_STEPS", 2_000)  # one update is enough
         env = StateUpsampled(PredatorCapturePrey(3, 2, 1, max_steps=10), 6)
         policy = make_policy("hetnet", env)
-        alone = Stage("source", make_learner(env, policy, CONFIG), 1, (0,), tmp_path / "source")
+        alone = StageRun("source", make_learner(env, policy, CONFIG), 1, (0,), tmp_path / "source")
         params = run_stage(alone, lambda: fresh_states(alone)).states.params
-        left = untrained_parameters(alone.directory, params)
+        left = untrained_parameters(alone.directory, alone.learner, params, (0,))
         between = [name for name in left if "a2a" in name]
         assert len(between) == 8  # weights and attention of both layers
         # One sender a relation: its attention is 1, whatever the parameters.

@@ -14,7 +14,7 @@ bounded. One program at a time may write to a directory; any number may read.
 """
 
 from sumajax.checkpoint.format import DESCRIPTION, MAX_DESCRIPTION_BYTES, MAX_STATE_BYTES
-from sumajax.checkpoint.reading import latest, load, load_params, read_meta
+from sumajax.checkpoint.reading import identity, latest, load, load_params, read_meta
 from sumajax.checkpoint.writing import save
 from sumajax.description import CheckpointError, check_compatible, describe, rebuild
 
@@ -25,6 +25,7 @@ __all__ = [
     "CheckpointError",
     "check_compatible",
     "describe",
+    "identity",
     "latest",
     "load",
     "load_params",

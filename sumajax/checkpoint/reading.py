@@ -10,8 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from sumajax.checkpoint.directory import candidates, newest_good
-from sumajax.checkpoint.files import verify_files
-from sumajax.checkpoint.format import ARRAYS, KEYS, DamagedError, Leaf, read_description
+from sumajax.checkpoint.files import file_digest, verify_files
+from sumajax.checkpoint.format import (
+    ARRAYS,
+    DESCRIPTION,
+    KEYS,
+    DamagedError,
+    Leaf,
+    read_description,
+)
 from sumajax.checkpoint.leaves import array_digest, compare, leaf_kind, named_leaves, nested
 from sumajax.checkpoint.orbax import load_arrays
 from sumajax.description import CheckpointError, reason
@@ -69,6 +76,11 @@ def read_meta(
         return description.meta
 
     return newest_good(Path(directory), read, say)
+
+
+def identity(directory: str | os.PathLike[str]) -> str:
+    """What the newest good checkpoint is known by, wherever it lies: a digest of its content."""
+    return newest_good(Path(directory), lambda path: file_digest(path / DESCRIPTION), None)
 
 
 def latest(directory: str | os.PathLike[str]) -> Path | None:

@@ -34,20 +34,39 @@ def with_config_file(experiment: type, arguments: list[str]) -> list[str]:
         return rest
     options = _read(chosen.config)
     options.pop("output", None)
+    if options.get("source_checkpoint"):
+        options["source_checkpoint"] = _beside(chosen.config, options["source_checkpoint"])
     return [*_arguments(options, experiment, chosen.config), *rest]
+
+
+def _beside(file: Path, path: str) -> str:
+    """A relative path in a file is one beside it; files of earlier versions meant the working
+    directory."""
+    beside = file.parent / path
+    return str(beside if beside.exists() or not Path(path).exists() else path)
 
 
 def _read(file: Path) -> dict[str, Any]:
     try:
         with open(file, "rb") as opened:
             text = opened.read(MAX_BYTES + 1)
-        options: Any = json.loads(text)["options"] if len(text) <= MAX_BYTES else None
+        content = json.loads(text) if len(text) <= MAX_BYTES else {}
+        options: Any = content["options"]
     except OSError as error:
         raise ValueError(f"{file} cannot be read ({error.strerror}).") from None
     except (ValueError, KeyError, TypeError, RecursionError):
-        options = None
+        content, options = {}, None
     if not isinstance(options, dict):
         raise ValueError(f"{file} is no config.json of a run.")
+    return _renewed(options) if "experiment" not in content else options
+
+
+def _renewed(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of a run from before there was a plan: preset `fast` annealed over every stage."""
+    learner = options.get("learner")
+    if options.get("preset") == "fast" and isinstance(learner, dict):
+        learner = {k: v for k, v in learner.items() if (k, v) != ("anneal_epochs", 0)}
+        return {**options, "learner": learner}
     return options
 
 
@@ -63,12 +82,22 @@ def _arguments(options: dict[str, Any], cls: type, file: Path, prefix: str = "")
                     "experiment; use the program that wrote it."
                 )
             continue
-        option = f"--{prefix}{name}".replace("_", "-")
         inner = types.get(name)
         if isinstance(value, dict) and isinstance(inner, type) and is_dataclass(inner):
             yield from _arguments(value, inner, file, f"{prefix}{name}.")
-        elif isinstance(value, bool):
-            yield option if value else f"--{prefix}no-{name}".replace("_", "-")
+        elif isinstance(value, dict):
+            for setting, given in value.items():
+                yield from _option(f"{prefix}{name}.{setting}", given)
         else:
-            yield option
-            yield from map(str, value if isinstance(value, list) else [value])
+            yield from _option(f"{prefix}{name}", value)
+
+
+def _option(name: str, value: Any) -> Iterator[str]:
+    """One option as arguments."""
+    option = f"--{name}".replace("_", "-")
+    if isinstance(value, bool):
+        *above, last = option.removeprefix("--").split(".")
+        yield option if value else "--" + ".".join([*above, f"no-{last}"])
+    else:
+        yield option
+        yield from map(str, value if isinstance(value, list) else [value])

@@ -1,12 +1,11 @@
-"""Trained policies on any task that fits them: other grids, other teams, sampled and greedy.
+"""`sumajax evaluate RUN`: trained policies on any task that fits them.
 
-python experiments/evaluate.py runs/pp_transfer-ic3net-fast
-python experiments/evaluate.py runs/pp_transfer-ic3net-fast --sizes 5 10 --teams 3 5 8
-python experiments/evaluate.py runs/pcp_transfer-hetnet-fast --teams 3+2 --json all.json
-python experiments/evaluate.py runs/mine/checkpoints/transfer --modes greedy --replay best.gif
+sumajax evaluate runs/pp_transfer-ic3net-fast
+sumajax evaluate runs/pp_transfer-ic3net-fast --sizes 5 10 --teams 3 5 8
+sumajax evaluate runs/pcp_transfer-hetnet-fast --teams 3+2 --json all.json
+sumajax evaluate runs/mine/checkpoints/transfer --modes greedy --replay best.gif
 """
 
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,24 +18,24 @@ import tyro
 
 from sumajax import checkpoint, reporting
 from sumajax.checkpoint import CheckpointError
-from sumajax.cli.command_line import parse, plain_errors, prepare_jax
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
-from sumajax.environments.types import Environment
-from sumajax.evaluation import (
-    ARMS,
-    EPISODES,
-    Agent,
-    evaluate,
-    load_agent,
-    shortest_path_steps,
+from sumajax.cli.domains import (
+    DOMAINS,
+    domain_of,
+    grid_label,
+    parse_size,
+    parse_team,
+    team_label,
+    with_size,
 )
+from sumajax.cli.options import parse, plain_errors, prepare_jax
+from sumajax.environments.types import Environment
+from sumajax.evaluation import EPISODES, Agent, load_agent, shortest_path_steps
+from sumajax.experiment.records import EVALUATION_SEED, held_out
 from sumajax.policies import Policy
-from sumajax.reporting.metrics import evaluation_summary
+from sumajax.transfer import stage_directories
 from sumajax.upsampling import StateUpsampled
 
 Mode = Literal["sampled", "greedy"]
-EVALUATION_SEED = 7
-"""Of the policy's own randomness; the starts are fixed in the package."""
 MAX_EPISODES = 65_536
 
 
@@ -51,7 +50,7 @@ class EvaluateConfig:
     teams: tuple[str, ...] = ()
     """Numbers of predators, or of predators+capture agents as 3+2; each grid's own if not given."""
     arms: tuple[str, ...] = ()
-    """Policies of the run: source, transfer, scratch; all if not given."""
+    """Stages of the run, as transfer or scratch; all if not given."""
     seeds: tuple[int, ...] = ()
     """Seeds of the run; all if not given."""
     modes: tuple[Mode, ...] = ("sampled", "greedy")
@@ -72,36 +71,37 @@ class Trained:
 
     name: str
     meta: dict[str, Any]
-    task: PredatorCapturePrey  # as trained on, before any upsampling
+    task: Any  # as trained on, before any upsampling
     grid: tuple[int, int]  # at which it sees the state
-    scale: str
     seeds: tuple[int, ...]
     agents: tuple[Agent, ...]  # by seed
 
-    def on(self, task: PredatorCapturePrey) -> tuple[Environment, Policy]:
+    def on(self, task: Any) -> tuple[Environment, Policy]:
         """The task as this policy sees it, and the policy for that team.
 
         Raises:
           ValueError: when it does not fit; names both values.
         """
+        trained_on = self.agents[0].env
         try:
             env: Any = task
-            if task.shape != self.grid:
-                env = StateUpsampled(task, self.grid, self.scale)  # type: ignore[arg-type]
+            if isinstance(trained_on, StateUpsampled):
+                env = replace(trained_on, env=task)
+            elif task.shape != self.grid:
+                env = StateUpsampled(task, self.grid)
         except ValueError:
+            mine, theirs = grid_label(self.grid), grid_label(task.shape)
             raise ValueError(
-                f"policy {self.name} sees a {_grid(self.grid)} grid, and {_grid(task.shape)} does "
-                "not divide it; choose --sizes that do."
+                f"policy {self.name} sees a {mine} grid, and {theirs} does not divide it; choose "
+                "--sizes that do."
             ) from None
-        policy = self.agents[0].policy
-        described = checkpoint.describe(env, policy)["task"]
-        env, policy = checkpoint.rebuild({**self.meta, "task": described})
+        policy = self.agents[0].policy.shaped_for(env)
         checkpoint.check_compatible(self.meta, env, policy, f"policy {self.name}")
         return env, policy
 
 
 def load(config: EvaluateConfig) -> list[Trained]:
-    """The policies to evaluate, in the order transfer, scratch, source.
+    """The policies to evaluate, the run's last stage first.
 
     Raises:
       CheckpointError: when there is none, or one is damaged or lacks a seed; ValueError: for an arm
@@ -109,19 +109,18 @@ def load(config: EvaluateConfig) -> list[Trained]:
     """
     if not config.path.is_dir():
         raise CheckpointError(f"{config.path} is no directory of a run or of checkpoints.")
-    folder = config.path / "checkpoints"
-    found = {arm: folder / arm for arm in ARMS if (folder / arm).is_dir()}
+    found = stage_directories(config.path)
     if not found:
         if config.arms:
             raise ValueError(
-                f"{config.path} is one policy; --arms is for a whole run with checkpoints/<arm>."
+                f"{config.path} is one policy; --arms is for a whole run with checkpoints/<stage>."
             )
         return [_trained(config.path, None, config.seeds)]
     for arm in config.arms:
         if arm not in found:
             raise ValueError(f"{config.path} has no arm {arm!r}; it has {', '.join(found)}.")
     return [
-        _trained(found[arm], arm, config.seeds) for arm in found if arm in (config.arms or ARMS)
+        _trained(found[arm], arm, config.seeds) for arm in found if arm in (config.arms or found)
     ]
 
 
@@ -132,87 +131,41 @@ def _trained(directory: Path, arm: str | None, seeds: tuple[int, ...]) -> Traine
         if seed not in saved:
             raise CheckpointError(f"{directory} holds seeds {list(saved)}, not {seed}.")
     seeds = seeds or saved
-    agents = tuple(load_agent(directory, seed=saved.index(seed)) for seed in seeds)
+    agents = tuple(load_agent(directory, seed=seed) for seed in seeds)
     env: Any = agents[0].env
     task = getattr(env, "env", env)
-    if not isinstance(task, PredatorCapturePrey):
-        raise CheckpointError(
-            f"{directory} is of a policy for {type(task).__name__}; this program knows "
-            "Predator-Prey and Predator-Capture-Prey."
-        )
     name = arm or str(meta.get("arm", directory.name))
-    scale = getattr(env, "scale", "none")
-    return Trained(name, meta, task, env.state_shape[1:], scale, seeds, agents)
+    return Trained(name, meta, task, env.state_shape[1:], seeds, agents)
 
 
-def tasks_of(config: EvaluateConfig, trained: Sequence[Trained]) -> list[PredatorCapturePrey]:
+def tasks_of(config: EvaluateConfig, trained: Sequence[Trained]) -> list[Any]:
     """Every asked grid with every asked team, each once; those of the policies if not given.
 
     Raises:
       ValueError: for what is no size or team, or a task that cannot be.
     """
     known = sorted({policy.task for policy in trained}, key=lambda task: task.shape)
-    sizes = [_parse_size(size) for size in config.sizes] or [task.shape for task in known]
-    tasks: list[PredatorCapturePrey] = []
+    sizes = [parse_size(size) for size in config.sizes] or [task.shape for task in known]
+    tasks: list[Any] = []
     for size in dict.fromkeys(sizes):
         like = next((task for task in known if task.shape == size), known[-1])
-        limit = like.max_steps if config.max_steps is None else config.max_steps
-        for changes in _teams(config.teams, like):
-            plain = size[0] if size[0] == size[1] else size
-            tasks.append(replace(like, size=plain, max_steps=limit, **changes))
+        for team in _teams(config.teams, like):
+            tasks.append(with_size(like, size, team, config.max_steps))
     return list(dict.fromkeys(tasks))
 
 
-def _teams(teams: Sequence[str], like: PredatorCapturePrey) -> Iterator[dict[str, Any]]:
+def _teams(teams: Sequence[str], like: Any) -> Iterator[dict[str, int]]:
     """What to change in `like` for each team."""
     if not teams:
         yield {}
     for team in teams:
-        if not re.fullmatch(r"\d{1,6}(\+\d{1,6})?", team):
-            raise ValueError(f"team {team!r} is no number of predators, or two as 3+2.")
-        predators, _, capturers = team.partition("+")
-        if isinstance(like, PredatorPrey):
-            if capturers:
-                raise ValueError(
-                    f"team {team} has capture agents, and Predator-Prey has none; "
-                    f"give the number of predators, as {predators}."
-                )
-            yield {"num_predators": int(predators)}
-        elif not capturers:
-            raise ValueError(
-                f"team {team} does not say how many capture agents; give both, as {team}+1."
-            )
-        else:
-            yield {"num_predators": int(predators), "num_capturers": int(capturers)}
+        yield parse_team(team, domain_of(like))
 
 
-def _parse_size(text: str) -> tuple[int, int]:
-    if not re.fullmatch(r"\d{1,6}(x\d{1,6})?", text):
-        raise ValueError(f"size {text!r} is no side of a grid, or rows x columns as 10x20.")
-    rows, _, columns = text.partition("x")
-    return int(rows), int(columns or rows)
-
-
-def play(policy: Trained, task: PredatorCapturePrey, mode: Mode, episodes: int) -> dict[str, Any]:
+def play(policy: Trained, task: Any, mode: Mode, episodes: int) -> dict[str, Any]:
     """Means over the held-out starts, one per seed (the EVAL of summary.json)."""
     env, shaped = policy.on(task)
-    means = []
-    for agent in policy.agents:
-        result = evaluate(
-            env,
-            shaped,
-            agent.params,
-            jax.random.key(EVALUATION_SEED),
-            episodes=episodes,
-            greedy=mode == "greedy",
-        )
-        means.append(jax.tree.map(lambda x: float(x.mean()), result))
-    return evaluation_summary(
-        episodes,
-        [mean.steps_taken for mean in means],
-        [mean.success for mean in means],
-        [mean.episode_return for mean in means],
-    )
+    return held_out(env, shaped, [agent.params for agent in policy.agents], episodes, mode)
 
 
 def run_evaluation(config: EvaluateConfig) -> dict[str, Any]:
@@ -240,10 +193,10 @@ def run_evaluation(config: EvaluateConfig) -> dict[str, Any]:
         },
         "tasks": [_play_all(config, trained, task) for task in tasks],
     }
-    reporting.print_table(table(report), title=f"steps taken and success: {config.path}")
     if config.json is not None:
         _check_new("json", config.json)
         reporting.write_json(config.json, report)
+    reporting.print_table(table(report), title=f"steps taken and success: {config.path}")
     if config.replay is not None:
         _check_new("replay", config.replay)
         _write_replay(config, trained[0], tasks[-1])
@@ -259,15 +212,13 @@ def _check(config: EvaluateConfig) -> None:
         _check_new(option, path)
 
 
-def _play_all(
-    config: EvaluateConfig, trained: Sequence[Trained], task: PredatorCapturePrey
-) -> dict[str, Any]:
+def _play_all(config: EvaluateConfig, trained: Sequence[Trained], task: Any) -> dict[str, Any]:
     """Every policy on one task, beside the bound of shortest paths."""
-    bound: Any = shortest_path_steps(task, config.episodes)
+    bound = shortest_path_steps(task, config.episodes)
     entry: dict[str, Any] = {
         "task": checkpoint.describe(task, trained[0].agents[0].policy)["task"],
         "label": label(task),
-        "shortest_path_steps": float(np.mean(bound)),
+        "shortest_path_steps": None if bound is None else float(np.mean(bound)),
         "policies": {},
     }
     for policy in trained:
@@ -288,20 +239,15 @@ def table(report: dict[str, Any]) -> list[dict[str, Any]]:
             for name, of_mode in entry["policies"].items():
                 steps, success = (np.mean(of_mode[mode][k]) for k in ("steps_taken", "success"))
                 row[name] = f"{steps:.2f} {success:6.1%}"
-            rows.append(row | {"bound": f"{entry['shortest_path_steps']:.2f}"})
+            bound = entry["shortest_path_steps"]
+            rows.append(row | {"bound": None if bound is None else f"{bound:.2f}"})
     return rows
 
 
-def label(task: PredatorCapturePrey) -> str:
+def label(task: Any) -> str:
     """A task in a few characters: grid and team."""
-    team = str(task.num_predators)
-    if not isinstance(task, PredatorPrey):
-        team += f"+{task.num_capturers}"
-    return f"{_grid(task.shape)}, {team}"
-
-
-def _grid(shape: tuple[int, int]) -> str:
-    return f"{shape[0]}x{shape[1]}"
+    known = any(type(task) is domain.task for domain in DOMAINS.values())
+    return f"{grid_label(task.shape)}, {team_label(task) if known else task.num_agents}"
 
 
 def _check_new(option: str, path: Path | None) -> None:
@@ -315,7 +261,7 @@ def _check_new(option: str, path: Path | None) -> None:
         raise ValueError(f"replay {path.name} must end in .gif, or .png for a strip of moments.")
 
 
-def _write_replay(config: EvaluateConfig, trained: Trained, task: PredatorCapturePrey) -> None:
+def _write_replay(config: EvaluateConfig, trained: Trained, task: Any) -> None:
     env, policy = trained.on(task)
     episode = reporting.record_episode(
         env,
@@ -329,13 +275,10 @@ def _write_replay(config: EvaluateConfig, trained: Trained, task: PredatorCaptur
     write(episode, config.replay)
 
 
-def main() -> None:
-    """Reads the options and evaluates."""
+def main(arguments: list[str] | None = None) -> None:
+    """Reads the options and evaluates; without `arguments` those of the program."""
     with plain_errors("stopped; no file was written."):
-        config = parse(EvaluateConfig, EvaluateConfig(path=tyro.MISSING))
+        prog = None if arguments is None else "sumajax evaluate"
+        config = parse(EvaluateConfig, EvaluateConfig(path=tyro.MISSING), arguments, prog=prog)
         prepare_jax(1)
         run_evaluation(config)
-
-
-if __name__ == "__main__":
-    main()

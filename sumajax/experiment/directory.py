@@ -7,7 +7,6 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,22 +14,26 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from sumajax import reporting
-from sumajax.cli.transfer_config import WHERE, TransferConfig
 
 
 @contextmanager
-def claimed(config: TransferConfig) -> Iterator[Path]:
+def claimed(
+    directory: Path, plan: dict[str, Any], options: dict[str, Any] | None = None
+) -> Iterator[Path]:
     """The run's directory, made or gone on with, and locked against a second run.
+
+    Args:
+      plan: what is run, from `plan.described`; a directory goes on with the same plan only.
+      options: of the command line, kept beside it for `--config`.
 
     Raises:
       ValueError: when it holds something else, a finished run, or one with other options.
       OSError: when it cannot be written.
     """
-    directory = config.directory
-    options = described(config)
+    plan, options = plain(plan), plain(options or {})
     missing: list[Path] = []
     try:
-        _check_directory(directory, options)  # before anything is written there
+        _check_directory(directory, plan, options)  # before anything is written there
         missing = [path for path in (directory, *directory.parents) if not os.path.lexists(path)]
         directory.mkdir(parents=True, exist_ok=True)
         lock = FileLock(directory / ".lock")
@@ -47,30 +50,29 @@ def claimed(config: TransferConfig) -> Iterator[Path]:
             f"cannot write to {directory} ({error.strerror}); choose another --output."
         ) from None
     try:
-        _check_directory(directory, options)
+        _check_directory(directory, plan, options)
         for path in directory.iterdir():
             if _LEFTOVER.fullmatch(path.name):
                 path.unlink()
         reporting.write_json(
             directory / "config.json",
-            {"command": sys.argv, "options": options, "versions": versions()},
+            {
+                "command": sys.argv,
+                "options": options,
+                "experiment": plan,
+                "versions": versions(),
+            },
         )
         yield directory
     finally:
         lock.release()
 
 
-def described(config: TransferConfig) -> dict[str, Any]:
-    """The options as config.json keeps them, without those of one host's place in the run."""
-    options = {**asdict(config), "devices": config.num_devices}
-    return plain({name: options[name] for name in options if name not in WHERE[1:]})
-
-
 _LEFTOVER = re.compile(r"\..+\.\d+\.tmp")
 """What a writer that was killed leaves of a file."""
 
 
-def _check_directory(directory: Path, described: dict[str, Any]) -> None:
+def _check_directory(directory: Path, plan: dict[str, Any], options: dict[str, Any]) -> None:
     file = directory / "config.json"
     if not file.exists():
         is_there = directory.is_dir()
@@ -82,22 +84,44 @@ def _check_directory(directory: Path, described: dict[str, Any]) -> None:
             )
         return
     try:
-        before = dict(json.loads(file.read_text())["options"])
+        config = dict(json.loads(file.read_text()))
+        before, now = dict(config["options"]), options
+        if "experiment" in config:
+            before, now = dict(config["experiment"]), plan
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{file} is not readable; choose another --output.") from None
-    changed = [
-        name
-        for name in described
-        if name not in WHERE and described[name] != before.get(name, described[name])
-    ]
-    if changed:
-        name = changed[0]
+    if changed := next(_differences(before, now), None):
+        name, theirs, ours = changed
         raise ValueError(
-            f"{directory} holds a run with {name} {before[name]}, not {described[name]}; "
+            f"{directory} holds a run with {name} {theirs}, not {ours}; "
             "choose another --output, or the same options to go on with it."
         )
     if (directory / "summary.json").exists():
         raise ValueError(f"{directory} holds a finished run; choose another --output or remove it.")
+
+
+_PLACES = ("output", "source_checkpoint", "devices", "log")
+"""Options that change nothing of what a run is; compared are those of runs without a plan."""
+
+
+def _differences(before: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """(name, value there, value here) of each setting that both have and that differs."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in before:
+            if key in now and (name or key not in _PLACES):
+                yield from _differences(before[key], now[key], f"{name} {key}".strip())
+    elif _stages(before) and _stages(now):
+        names = [[stage["name"] for stage in stages] for stages in (before, now)]
+        if names[0] != names[1]:
+            yield name, names[0], names[1]
+        for theirs, ours in zip(before, now, strict=False):
+            yield from _differences(theirs, ours, f"{theirs['name']}:")
+    elif before != now:
+        yield name, before, now
+
+
+def _stages(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(x, dict) for x in value)
 
 
 def plain(value: Any) -> Any:

@@ -1,7 +1,7 @@
 """The learner's settings and their two presets. Sources of every number: docs/settings.md."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import inf
 from numbers import Real
 from typing import Any, Literal, get_args
@@ -43,7 +43,8 @@ class LearnerConfig:
       clip_per_env: clip each environment's gradient alone before they are added, as processes do.
       warmup_epochs: the learning rate rises linearly from 0 over this many epochs.
       anneal_epochs: learning rate and entropy weight fall linearly to `anneal_to` of their start
-        over this many epochs; 0 keeps them constant.
+        over this many epochs; 0 keeps them constant; None: over the whole stage, whose length
+        `for_stage` tells, constant as long as it is not told.
       detach_gap: no gradient through the memory past every so many steps of an episode; None: none
         past the start of the segment.
 
@@ -70,12 +71,28 @@ class LearnerConfig:
     max_grad_norm: float | None = 0.5
     clip_per_env: bool = False
     warmup_epochs: int = 0
-    anneal_epochs: int = 0
+    anneal_epochs: int | None = None
     anneal_to: float = 0.02
     detach_gap: int | None = None
 
     def __post_init__(self) -> None:
         _validate(self)
+
+    def for_stage(self, epochs: int, *, transferred: bool = False) -> "LearnerConfig":
+        """The settings of a stage of so many epochs, ready for `make_learner`.
+
+        Args:
+          transferred: it goes on from parameters that were trained on another task, at
+            `transfer_rate` of the learning rate.
+
+        Twice is the same as once.
+        """
+        return replace(
+            self,
+            anneal_epochs=epochs if self.anneal_epochs is None else self.anneal_epochs,
+            learning_rate=self.learning_rate * (self.transfer_rate if transferred else 1.0),
+            transfer_rate=1.0,
+        )
 
     @property
     def updates_per_epoch(self) -> int:
@@ -99,6 +116,7 @@ _PUBLISHED: dict[str, Any] = {
     "learning_rate": 1e-3,
     "transfer_rate": 1.0,
     "max_grad_norm": None,
+    "anneal_epochs": 0,
     "detach_gap": 10,
 }
 
@@ -152,7 +170,7 @@ def preset(name: str, policy: str = "ic3net", **changes: Any) -> LearnerConfig:
     return LearnerConfig(**{**PRESETS[name].get(policy, {}), **changes})
 
 
-_OPTIONAL = ("max_grad_norm", "detach_gap")
+_OPTIONAL = ("max_grad_norm", "anneal_epochs", "detach_gap")
 """Settings that None turns off."""
 
 _LEAST: dict[str, int] = {

@@ -146,6 +146,10 @@ class Policy:
     def team(self) -> TeamSpec:
         return self.module.team
 
+    def shaped_for(self, env: Environment) -> "Policy":
+        """This policy for another task or team, with the same settings; parameters still fit."""
+        return Policy(self.name, self.module.clone(team=TeamSpec.of(env)))
+
     def init(self, key: chex.PRNGKey) -> Any:
         """Fresh parameters."""
         team = self.team

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
         rows_of,
         truncate_after,
         write_json,
-        write_summary,
         write_text,
     )
     from sumajax.reporting.progress import Progress, print_table, result_table
@@ -37,7 +36,6 @@ __all__ = [
     "write_gif",
     "write_json",
     "write_strip",
-    "write_summary",
     "write_text",
 ]
 

@@ -1,4 +1,4 @@
-"""Learning curves of a transfer experiment, drawn without a display and without global state."""
+"""Learning curves of an experiment, drawn without a display and without global state."""
 
 import io
 import textwrap
@@ -13,17 +13,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from sumajax.reporting.metrics import ARMS, read_metrics, seed_curves, write_bytes
+from sumajax.reporting.metrics import read_metrics, seed_curves, write_bytes
 
 # Okabe and Ito's palette (2008) keeps its colours apart under every common colour blindness; line
 # styles say the same once more in grey.
-COLOURS = {"source": "#E69F00", "transfer": "#0072B2", "scratch": "#D55E00"}
-STYLES: dict[str, Any] = {"source": (0, (4, 1.5)), "transfer": "-", "scratch": "-"}
-ARM_LABELS = {
-    "source": "source task",
-    "transfer": "target, after transfer",
-    "scratch": "target, from scratch",
-}
+TARGET_COLOUR = "#0072B2"
+ON_THE_WAY_COLOURS = ("#E69F00", "#009E73", "#CC79A7", "#56B4E9")
+RIVAL_COLOURS = ("#D55E00", "#000000", "#999999")
+DASHED: Any = (0, (4, 1.5))
 Y_LABELS = {
     "steps_taken": "steps taken per episode",
     "success": "success rate",
@@ -55,14 +52,14 @@ def learning_curves(
     bounds: Mapping[str, float] | None = None,
     labels: Mapping[str, str] | None = None,
     title: str | None = None,
-    source_cost: Mapping[str, float] | None = None,
+    after: Mapping[str, Sequence[str]] | None = None,
     log_y: bool | None = None,
 ) -> Figure:
     """Learning curves of the arms in `metrics`, one panel for each quantity in `x`.
 
-    The transferred arm starts where the source ended, so that at any x all arms have cost the same
-    in all (the form of the paper's Figure 2). Over three seeds and more a line is the median and
-    its band the quartiles; below that the mean, least and greatest.
+    An arm starts where those ended that it comes after, so that at any x all arms have cost the
+    same in all (the form of the paper's Figure 2). Over three seeds and more a line is the median
+    and its band the quartiles; below that the mean, least and greatest.
 
     Args:
       metrics: path of a metrics.csv, or its rows.
@@ -71,7 +68,8 @@ def learning_curves(
       y: any numeric column of metrics.csv.
       bounds: reference levels, drawn as thin lines: name to value.
       labels: other names for the arms.
-      source_cost: what the source cost, by name of `x`, where its rows are in another file.
+      after: for each arm the arms it comes after, the first one first; the arm that comes after
+        most is the target, drawn in blue, and those before it are dashed.
       log_y: None draws steps taken on a logarithmic axis where they spread over a factor of four.
 
     Raises:
@@ -82,10 +80,12 @@ def learning_curves(
     for name in panels:
         if name not in AXES:
             raise ValueError(f"x must be one of {', '.join(AXES)}, got {name!r}.")
-    columns = [arm_curves(rows, name, y, source_cost) for name in panels]
+    after = after or {}
+    columns = [arm_curves(rows, name, y, after) for name in panels]
     if not columns[0]:
         raise ValueError(f"there is no {y} of any arm to draw.")
-    figure = _draw(panels, columns, y, bounds or {}, {**ARM_LABELS, **(labels or {})}, log_y)
+    looks = _looks(list(columns[0]), after, labels or {})
+    figure = _draw(panels, columns, y, bounds or {}, looks, log_y)
     _draw_legend(figure, columns[0], title)
     if output is not None:
         write_png(figure, output)
@@ -93,23 +93,44 @@ def learning_curves(
 
 
 def arm_curves(
-    rows: Sequence[Mapping[str, Any]],
-    x: str,
-    y: str,
-    source_cost: Mapping[str, float] | None = None,
+    rows: Sequence[Mapping[str, Any]], x: str, y: str, after: Mapping[str, Sequence[str]]
 ) -> dict[str, Curve]:
-    """The curve of every arm that has one, the transferred arm's shifted by the source's cost."""
+    """The curve of every arm that has one, shifted by the cost of the arms it comes `after`."""
     curves = {}
-    for arm in ARMS:
+    for arm in dict.fromkeys(row["arm"] for row in rows):
         _, values = seed_curves(rows, arm, x, y)
         seen = np.isfinite(values[y]).any(axis=0)  # epochs in which no episode ended are left out
         if not seen.any():
             continue
         middle, low, high = spread(values[y][:, seen])
-        shift = (source_cost or {}).get(x, _cost(rows, x)) if arm == "transfer" else 0.0
+        shift = sum(_cost(rows, x, before) for before in after.get(arm, ()))
         position = shift + _over_seeds(np.nanmean, values[x][:, seen])
         curves[arm] = Curve(position, middle, low, high, len(values[y]), shift)
     return curves
+
+
+@dataclass(frozen=True)
+class _Look:
+    """How an arm is drawn."""
+
+    label: str
+    colour: str
+    style: Any
+
+
+def _looks(
+    arms: Sequence[str], after: Mapping[str, Sequence[str]], labels: Mapping[str, str]
+) -> dict[str, _Look]:
+    target = max(arms, key=lambda arm: len(after.get(arm, ())))
+    before = [arm for arm in arms if arm in after.get(target, ())]
+    rivals = [arm for arm in arms if arm not in (target, *before)]
+    colours = {target: TARGET_COLOUR}
+    for group, palette in ((before, ON_THE_WAY_COLOURS), (rivals, RIVAL_COLOURS)):
+        colours |= {arm: palette[place % len(palette)] for place, arm in enumerate(group)}
+    return {
+        arm: _Look(labels.get(arm, arm), colours[arm], DASHED if arm in before else "-")
+        for arm in arms
+    }
 
 
 def spread(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -139,9 +160,9 @@ def _over_seeds(function: Any, values: np.ndarray) -> np.ndarray:
     return np.asarray(function(values, axis=0))
 
 
-def _cost(rows: Sequence[Mapping[str, Any]], x: str) -> float:
-    """What the source stage cost by its end, mean over seeds; 0 without one."""
-    _, values = seed_curves(rows, "source", x)
+def _cost(rows: Sequence[Mapping[str, Any]], x: str, arm: str) -> float:
+    """What an arm cost by its end, mean over seeds; 0 where its rows are elsewhere."""
+    _, values = seed_curves(rows, arm, x)
     return float(np.nanmax(values[x], axis=1).mean()) if values[x].size else 0.0
 
 
@@ -150,14 +171,14 @@ def _draw(
     columns: Sequence[Mapping[str, Curve]],
     y: str,
     bounds: Mapping[str, float],
-    names: Mapping[str, str],
+    looks: Mapping[str, _Look],
     log_y: bool | None,
 ) -> Figure:
     figure = Figure(figsize=(9.0 if len(panels) > 1 else 6.0, 3.9), dpi=200, layout="constrained")
     FigureCanvasAgg(figure)
     all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, name, curves in zip(all_axes, panels, columns, strict=True):
-        _draw_panel(axes, curves, name, names)
+        _draw_panel(axes, curves, name, looks)
     all_axes[0].set_ylabel(Y_LABELS.get(y, y.replace("_", " ")), color=INK)
     _scale_y(all_axes[0], columns[0], y, bounds, log_y)
     for axes in all_axes:
@@ -165,22 +186,29 @@ def _draw(
     return figure
 
 
-def _draw_panel(axes: Axes, curves: Mapping[str, Curve], x: str, names: Mapping[str, str]) -> None:
+def _draw_panel(
+    axes: Axes, curves: Mapping[str, Curve], x: str, looks: Mapping[str, _Look]
+) -> None:
     unit, label = _unit(x, max(curve.x.max() for curve in curves.values()))
     for arm, curve in curves.items():
         if curve.num_seeds > 1:
             axes.fill_between(
-                curve.x / unit, curve.low, curve.high, color=COLOURS[arm], alpha=0.2, linewidth=0
+                curve.x / unit,
+                curve.low,
+                curve.high,
+                color=looks[arm].colour,
+                alpha=0.2,
+                linewidth=0,
             )
         axes.plot(
             curve.x / unit,
             curve.middle,
-            color=COLOURS[arm],
-            linestyle=STYLES[arm],
+            color=looks[arm].colour,
+            linestyle=looks[arm].style,
             linewidth=1.6,
             marker="o" if len(curve.x) == 1 else None,
             markersize=4,
-            label=names[arm],
+            label=looks[arm].label,
         )
     dress(axes, label)
 
@@ -294,8 +322,6 @@ def _note(curves: Mapping[str, Curve]) -> str:
     seeds = max(curve.num_seeds for curve in curves.values())
     few = {1: "one seed", 2: "mean of two seeds, band: both"}
     note = few.get(seeds, f"median of {seeds} seeds, band: quartiles")
-    if "transfer" not in curves:
-        return note
-    if curves["transfer"].shift > 0:
-        return f"{note}; the transferred policy starts at the cost of its source training"
-    return f"{note}; what the source training cost is not counted"
+    if any(curve.shift > 0 for curve in curves.values()):
+        return f"{note}; a stage starts at the cost of those before it"
+    return note

@@ -1,7 +1,8 @@
 """metrics.csv and summary.json: what a run leaves for other programs to read.
 
-A row of metrics.csv belongs to one arm (`source`, `transfer` or `scratch`), one seed and one epoch.
-Epochs count from 1; `env_steps` and `seconds` count the arm's own training from 0. Rows are only
+A row of metrics.csv belongs to one arm (a stage of the experiment), one seed and one epoch. Epochs
+count from 1; `env_steps`, `seconds` and `cpu_seconds` count the arm's own training from 0, the last
+of them user and system time of the process, which trains all seeds. Rows are only
 ever appended, in whole chunks, and cut back on resume, so the file never holds half a row, a gap or
 a double.
 """
@@ -31,11 +32,14 @@ COLUMNS = (
     "value_loss",
     "gradient_norm",
     "communication",
+    "cpu_seconds",
 )
 """The columns of metrics.csv, in order; other programs rely on them."""
 
+YOUNGER = ("cpu_seconds",)
+"""Columns that files of earlier versions lack; they are read as NaN."""
+
 INTEGERS = ("seed", "epoch", "env_steps")
-ARMS = ("source", "transfer", "scratch")
 FIRST_EPOCH = 1
 
 Row = dict[str, Any]
@@ -90,6 +94,7 @@ def append_rows(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
       ValueError: for a row without exactly the columns of the file, or a file of other columns.
     """
     text = "".join(_line(_cells(row)) for row in rows)
+    _renew(Path(path))
     with open(path, "a+b") as file:
         whole = _whole_size(file)
         file.truncate(whole)
@@ -104,6 +109,17 @@ def append_rows(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
         os.fsync(file.fileno())
 
 
+def _renew(path: Path) -> None:
+    """A file of an earlier version, with the columns that it lacks."""
+    if not path.exists():
+        return
+    with open(path, encoding="utf-8") as file:
+        first = file.readline()
+    if first.endswith("\n") and _check_header(first, path) != list(COLUMNS):
+        rows = read_metrics(path)
+        write_text(path, _line(COLUMNS) + "".join(_line(_cells(row)) for row in rows))
+
+
 def read_metrics(path: str | Path) -> list[Row]:
     """The rows of metrics.csv in file order; empty cells are NaN, a torn last row is left out.
 
@@ -115,9 +131,10 @@ def read_metrics(path: str | Path) -> list[Row]:
     lines = text[: text.rfind("\n") + 1].splitlines()
     if not lines:
         return []
-    _check_header(lines[0], path)
+    columns = _check_header(lines[0], path)
     return [
-        _parse(cells, path, number) for number, cells in enumerate(csv.reader(lines[1:]), start=2)
+        _parse(cells, columns, path, number)
+        for number, cells in enumerate(csv.reader(lines[1:]), start=2)
     ]
 
 
@@ -190,68 +207,46 @@ def env_steps_to_threshold(
     ]
 
 
-def steps_taken_ratio(rows: Iterable[Mapping[str, Any]]) -> float | None:
-    """Steps taken from scratch over steps taken after transfer, at the last epoch of both arms.
+def steps_taken_ratio(rows: Iterable[Mapping[str, Any]], arm: str, other: str) -> float | None:
+    """Steps taken in `arm` over those in `other`, at the last epoch that both have.
 
-    Both count target environment steps alone and are means over the seeds; above 1 the transfer is
-    better. None when an arm is missing or has no value there.
+    Both are means over the seeds; above 1 the other is better. None when an arm is missing or has
+    no value there.
     """
     rows = list(rows)
-    ends = {arm: complete_epochs(rows, arm) for arm in ("transfer", "scratch")}
-    epoch = min(ends.values())
-    means = {}
-    for arm in ends:
-        taken = [r["steps_taken"] for r in rows if r["arm"] == arm and r["epoch"] == epoch]
+    epoch = min(complete_epochs(rows, arm), complete_epochs(rows, other))
+    means = []
+    for name in (arm, other):
+        taken = [r["steps_taken"] for r in rows if r["arm"] == name and r["epoch"] == epoch]
         taken = [value for value in taken if not math.isnan(value)]
         if not taken:
             return None
-        means[arm] = float(np.mean(taken))
-    return means["scratch"] / means["transfer"]
+        means.append(float(np.mean(taken)))
+    return means[0] / means[1]
 
 
-def comparison(rows: Iterable[Mapping[str, Any]], threshold: float) -> dict[str, Any]:
-    """The `comparison` entry of summary.json, from the rows of metrics.csv."""
-    rows = list(rows)
-    return {
-        "steps_taken_ratio": steps_taken_ratio(rows),
-        "threshold": threshold,
-        "env_steps_to_threshold": {
-            arm: env_steps_to_threshold(rows, arm, threshold) for arm in ("transfer", "scratch")
-        },
-    }
+TRANSFERRED = {"transfer": "transfer", "scratch": "scratch"}
+"""Roles of a comparison, and what the arms are called in an experiment of two stages."""
 
 
-def write_summary(
-    path: str | Path,
-    *,
-    experiment: str,
-    policy: str,
-    preset: str,
-    seeds: Sequence[int],
-    arms: Mapping[str, Mapping[str, Any] | None],
-    zero_shot: Mapping[str, Any] | None = None,
-    comparison: Mapping[str, Any] | None = None,
-    **more: Any,
-) -> None:
-    """Writes summary.json (design.md section 6).
+def comparison(
+    rows: Iterable[Mapping[str, Any]], threshold: float, arms: Mapping[str, str] = TRANSFERRED
+) -> dict[str, Any]:
+    """The `comparison` entry of summary.json, from the rows of metrics.csv.
 
     Args:
-      arms: an entry for each arm that ran, see `arm_summary`; one that did not is null.
-      zero_shot: see `evaluation_summary`.
-      comparison: see `comparison`.
-      more: further entries, after the fixed ones.
+      arms: which arm is the `transfer` and which the `scratch`; either may be missing.
     """
-    summary = {
-        "experiment": experiment,
-        "policy": policy,
-        "preset": preset,
-        "seeds": [int(seed) for seed in seeds],
-        **{arm: arms.get(arm) for arm in ARMS},
-        "zero_shot": zero_shot,
-        "comparison": comparison,
-        **more,
+    rows = list(rows)
+    named = [arms.get(role, "") for role in ("scratch", "transfer")]
+    return {
+        "steps_taken_ratio": steps_taken_ratio(rows, *named),
+        "threshold": threshold,
+        "env_steps_to_threshold": {
+            role: env_steps_to_threshold(rows, arms.get(role, ""), threshold)
+            for role in ("transfer", "scratch")
+        },
     }
-    write_json(path, summary)
 
 
 def arm_summary(
@@ -351,9 +346,9 @@ def _line(cells: Iterable[str]) -> str:
     return text.getvalue()
 
 
-def _parse(cells: list[str], path: str | Path, number: int) -> Row:
+def _parse(cells: list[str], columns: Sequence[str], path: str | Path, number: int) -> Row:
     try:
-        row = dict(zip(COLUMNS, cells, strict=True))
+        row = dict.fromkeys(COLUMNS, "") | dict(zip(columns, cells, strict=True))
         return {name: _number(name, cell) for name, cell in row.items()}
     except ValueError as error:
         raise ValueError(f"{path}, line {number}: not a row of metrics ({error}).") from None
@@ -367,12 +362,15 @@ def _number(name: str, cell: str) -> str | int | float:
     return float(cell) if cell else math.nan
 
 
-def _check_header(line: str, path: str | Path) -> None:
-    if line.rstrip("\r\n") != ",".join(COLUMNS):
+def _check_header(line: str, path: str | Path) -> list[str]:
+    """The columns of a file, all or all but the younger ones."""
+    columns = line.rstrip("\r\n").split(",")
+    if columns not in (list(COLUMNS), [name for name in COLUMNS if name not in YOUNGER]):
         raise ValueError(
             f"{path} is not a metrics file of this version: its first line should be "
             f"{','.join(COLUMNS)}."
         )
+    return columns
 
 
 def _whole_size(file: io.BufferedRandom) -> int:

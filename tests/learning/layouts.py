@@ -16,7 +16,7 @@ from trajectories import TINY_TASK, tiny_learner
 
 from sumajax import hosts
 from sumajax.learning import parallel
-from sumajax.transfer import Stage, fresh_states, run_stage
+from sumajax.transfer import StageRun, fresh_states, run_stage
 
 SEED = 3
 NUM_ENVS = 200
@@ -26,7 +26,7 @@ def stage_of(directory, epochs):
     learner = tiny_learner(
         TINY_TASK, num_envs=NUM_ENVS, rollout_length=20, advantages="normalised", anneal_epochs=2
     )
-    return Stage("source", learner, epochs, (SEED,), Path(directory))
+    return StageRun("source", learner, epochs, (SEED,), Path(directory))
 
 
 def train(directory, devices, epochs):

@@ -4,9 +4,10 @@ import json
 import os
 
 import pytest
-from pp_transfer import PPTransfer
 
+from sumajax.cli.transfer import PPTransfer
 from sumajax.experiment.directory import claimed
+from sumajax.experiment.plan import described
 
 HERE = "127.0.0.1:1234"
 
@@ -38,11 +39,16 @@ def test_devices_of_each_host(monkeypatch):
 
 def test_a_run_goes_on_with_other_devices_and_hosts(tmp_path):
     output = tmp_path / "run"
-    with claimed(PPTransfer(output=output, devices=1)):
+
+    def claim(**options):
+        config = PPTransfer(output=output, **options)
+        return claimed(output, described(config.experiment()), config.where().options)
+
+    with claim(devices=1):
         pass
-    with claimed(PPTransfer(output=output, devices=5, hosts=2, coordinator=HERE)):
+    with claim(devices=5, hosts=2, coordinator=HERE):
         options = json.loads((output / "config.json").read_text())["options"]
     assert options["devices"] == 5
     assert not {"hosts", "host", "coordinator"} & options.keys()
     with pytest.raises(ValueError, match=r"holds a run with threshold 20\.0, not 21\.0"):
-        claimed(PPTransfer(output=output, threshold=21.0)).__enter__()
+        claim(threshold=21.0).__enter__()

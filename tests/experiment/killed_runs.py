@@ -1,11 +1,10 @@
-"""Runs of `experiments/pp_transfer.py` that are killed: a server that forks a process for each.
+"""Runs of `sumajax transfer pp` that are killed: a server that forks a process for each.
 
 Reads a line of JSON for each run: its `arguments`, the `directory` it writes to, its `log`, and
 when to kill it: `event`, the number of the file operation in that directory at whose beginning it
 gets the `signal`, or, with SIGKILL, `seconds` after its start; null for never. Answers with its
 exit `status`, minus the signal if that ended or stopped it, the `events` it came to and its `pid`.
-Imports are made once; everything after them is the program's own, with a smaller policy, fewer
-held-out episodes and a checkpoint every epoch.
+Imports are made once; everything after them is the program's own.
 """
 
 import json
@@ -15,24 +14,12 @@ import signal
 import struct
 import sys
 import time
-from functools import partial
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 
 import matplotlib.pyplot  # noqa: F401
 from orbax.checkpoint import v1  # noqa: F401
-from pp_transfer import PPTransfer
 
-from sumajax import evaluate
-from sumajax.cli import command_line
-from sumajax.experiment import run as transfer_run
-from sumajax.policies import make_policy
-from sumajax.transfer import run_stage
-
-transfer_run.make_policy = lambda name, env: make_policy(name, env, hidden=8)
-transfer_run.evaluate = partial(evaluate, episodes=16)
-transfer_run.run_stage = partial(run_stage, chunk=1)
+from sumajax import cli
+from sumajax.cli import evaluate, transfer  # noqa: F401
 
 OPERATIONS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate", "os.scandir"}
 
@@ -64,10 +51,10 @@ def run(request: dict, counter: mmap.mmap) -> None:
                 os.kill(os.getpid(), request["signal"])
 
     sys.addaudithook(count)
-    sys.argv = ["pp_transfer.py", *request["arguments"]]
+    arguments = ["transfer", "pp", *request["arguments"]]
     status = 0
     try:
-        command_line.main(PPTransfer)
+        cli.main(arguments)
     except SystemExit as stop:
         status = int(stop.code or 0)
     sys.stdout.flush()

@@ -5,24 +5,24 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
-from pcp_transfer import PCPTransfer
-from pp_transfer import PPTransfer
 
-from sumajax.cli import command_line
+from sumajax.cli import options as shared
 from sumajax.cli.config_file import with_config_file
+from sumajax.cli.transfer import PCPTransfer, PPTransfer
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import preset
 
 
 def written(file, config):
     """As a run writes it."""
-    file.write_text(json.dumps({"options": json.loads(json.dumps(asdict(config), default=str))}))
+    options = json.loads(json.dumps(asdict(config), default=str))
+    file.write_text(json.dumps({"options": options, "experiment": {}}))
     return file
 
 
 def read(experiment, arguments):
     arguments = with_config_file(experiment, [str(argument) for argument in arguments])
-    return command_line.parse(experiment, experiment(), arguments)
+    return shared.parse(experiment, experiment(), arguments)
 
 
 RUNS = {
@@ -33,7 +33,7 @@ RUNS = {
         seeds=(3, 4),
         scratch=False,
         threshold=12.5,
-        source_checkpoint=Path("a/b"),
+        source_checkpoint=Path("/a/b"),
         devices=1,
         learner=preset("paper", "ic3net", detach_gap=None, max_grad_norm=0.5),
     ),
@@ -73,7 +73,11 @@ BAD = {
     "no options": ("{tmp}/a.json", '{"options": 3}', "a.json is no config.json of a run"),
     "too long": ("{tmp}/a.json", " " * 2**21, "a.json is no config.json of a run"),
     "unknown option": ("{tmp}/a.json", '{"options": {"spam": 1}}', "Unrecognized options: --spam"),
-    "wrong value": ("{tmp}/a.json", '{"options": {"source_epochs": "x"}}', "takes a whole number"),
+    "wrong value": (
+        "{tmp}/a.json",
+        '{"options": {"source_epochs": "x"}}',
+        "invalid literal",
+    ),
     "refused value": (
         "{tmp}/a.json",
         '{"options": {"source_epochs": 0}}',
@@ -88,11 +92,31 @@ BAD = {
 
 
 @pytest.mark.parametrize(("file", "text", "sentence"), BAD.values(), ids=BAD)
-def test_a_mistake_gets_one_sentence(file, text, sentence, tmp_path):
+def test_a_mistake_gets_one_sentence(file, text, sentence, tmp_path, capsys):
+    """Of ours, or what the parser says."""
     if text is not None:
         (tmp_path / "a.json").write_text(text)
-    with pytest.raises(ValueError, match=sentence.split("(")[0]):
+    with pytest.raises((ValueError, SystemExit)) as stop:
         read(PPTransfer, ["--config", file.format(tmp=tmp_path)])
+    assert sentence in str(stop.value) + " ".join(capsys.readouterr().err.split())
+
+
+def test_a_relative_path_is_beside_the_file(tmp_path, monkeypatch):
+    (tmp_path / "here" / "a" / "b").mkdir(parents=True)
+    file = written(tmp_path / "here" / "config.json", PPTransfer(source_checkpoint=Path("a/b")))
+    monkeypatch.chdir(tmp_path)
+    expected = tmp_path / "here" / "a" / "b"
+    assert read(PPTransfer, ["--config", file]).source_checkpoint == expected
+
+
+def test_a_file_from_before_there_were_plans_anneals_as_it_did(tmp_path):
+    old = PPTransfer(learner=preset("fast", anneal_epochs=0))
+    file = written(tmp_path / "config.json", old)
+    assert read(PPTransfer, ["--config", file]).learner.anneal_epochs == 0
+    content = json.loads(file.read_text())
+    del content["experiment"]
+    file.write_text(json.dumps(content))
+    assert read(PPTransfer, ["--config", file]).learner.anneal_epochs is None
 
 
 def test_a_file_must_be_given():

@@ -5,20 +5,20 @@ from contextlib import contextmanager
 
 import pytest
 
-from sumajax.experiment import run as transfer_run
+from sumajax.experiment.run import Recorder
 
 
 @contextmanager
 def stopped_in(arm: str, error: type[BaseException]) -> Iterator[None]:
     """`error` is raised, and expected, after the first rows of `arm` and before its checkpoint."""
-    record = transfer_run.Recorder._record
+    record = Recorder._record
 
-    def stop(self, stage, chunk):
-        record(self, stage, chunk)
-        if stage.arm == arm:
+    def stop(self, stage, stage_run, chunk):
+        record(self, stage, stage_run, chunk)
+        if stage.name == arm:
             raise error
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(transfer_run.Recorder, "_record", stop)
+        patch.setattr(Recorder, "_record", stop)
         with pytest.raises(error):
             yield
