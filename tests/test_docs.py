@@ -8,7 +8,8 @@ import pytest
 DOCS = Path(__file__).parents[1] / "docs"
 
 
-def test_extending(capsys):
+def test_extending(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     shared: dict = {}
     for code in re.findall(r"```python\n(.*?)```", (DOCS / "extending.md").read_text(), re.DOTALL):
         exec(compile(code, "extending.md", "exec"), shared)
@@ -16,6 +17,8 @@ def test_extending(capsys):
     assert shared["result"].success.mean() > 0.9  # measured: 1.0, a random policy 0.12
     assert shared["metrics"].success[-1] > 0.9  # the memoryless policy's, in training: 1.0
     assert capsys.readouterr().out.count("steps taken") == 2
+    assert shared["summary"]["transfer"]["env_steps"] == 40_000
+    assert shared["agent"].env == shared["Line"](12, max_steps=24)
 
 
 def test_jaxmarl(capsys):

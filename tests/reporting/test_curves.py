@@ -31,12 +31,24 @@ def run(seeds=3, arms=("source", "transfer", "scratch")):
     return rows
 
 
+AFTER = {"transfer": ["source"]}
+LABELS = {
+    "source": "source task",
+    "transfer": "target, after transfer",
+    "scratch": "target, from scratch",
+}
+
+
+def curves(metrics, *args, **options):
+    return learning_curves(metrics, *args, **{"after": AFTER, "labels": LABELS, **options})
+
+
 def lines(axes):
     return {line.get_label(): line for line in axes.get_lines() if line.get_label()[0] != "_"}
 
 
 def test_lines_hold_the_data_and_transfer_starts_at_the_cost_of_its_source():
-    steps, seconds = learning_curves(run()).axes
+    steps, seconds = curves(run()).axes
     drawn = lines(steps)
     assert list(drawn) == ["source task", "target, after transfer", "target, from scratch"]
     epoch = np.arange(1, 9)
@@ -64,7 +76,7 @@ def test_the_axis_is_in_units_that_give_short_numbers(x, largest, label, last):
     epoch = np.arange(1, 11)
     values = {"env_steps": epoch, "steps_taken": 100 / epoch}
     rows = rows_of("scratch", [0], 1, {**values, x: epoch * largest // 10})
-    (axes,) = learning_curves(rows, x=x).axes
+    (axes,) = curves(rows, x=x).axes
     assert axes.get_xlabel() == label
     assert lines(axes)["target, from scratch"].get_xdata()[-1] == pytest.approx(last)
 
@@ -83,7 +95,7 @@ def test_middle_and_band_follow_the_number_of_seeds():
     ("seeds", "bands", "note"), [(1, 0, "one seed"), (2, 3, "both"), (3, 3, "quartiles")]
 )
 def test_the_spread_is_drawn_and_named(seeds, bands, note):
-    figure = learning_curves(run(seeds))
+    figure = curves(run(seeds))
     assert len(figure.axes[0].collections) == bands
     assert note in figure.get_supxlabel()
 
@@ -93,7 +105,7 @@ def test_an_epoch_in_which_no_episode_ended_is_left_out():
     for row in rows:
         if row["arm"] == "scratch" and row["epoch"] <= 2:
             row["steps_taken"] = math.nan
-    assert len(arm_curves(rows, "env_steps", "steps_taken")["scratch"].x) == 6
+    assert len(arm_curves(rows, "env_steps", "steps_taken", AFTER)["scratch"].x) == 6
     for row in rows:
         row["steps_taken"] = math.nan
     with pytest.raises(ValueError, match="no steps_taken"):
@@ -101,18 +113,26 @@ def test_an_epoch_in_which_no_episode_ended_is_left_out():
 
 
 def test_arms_may_be_missing():
-    figure = learning_curves(run(arms=("source", "transfer")))
+    figure = curves(run(arms=("source", "transfer")))
     assert list(lines(figure.axes[0])) == ["source task", "target, after transfer"]
     rows = run(arms=("transfer",))
-    assert arm_curves(rows, "env_steps", "steps_taken")["transfer"].x[0] == 20_000
-    assert "not counted" in learning_curves(rows).get_supxlabel()
-    cost = {"env_steps": 7_000.0}
-    assert arm_curves(rows, "env_steps", "steps_taken", cost)["transfer"].x[0] == 27_000
+    assert arm_curves(rows, "env_steps", "steps_taken", AFTER)["transfer"].x[0] == 20_000
+    assert "starts at the cost" not in curves(rows).get_supxlabel()
+
+
+def test_a_chain_of_any_length_adds_up_and_rivals_start_at_nothing():
+    after = {"transfer": ["source"], "scratch": ["source", "transfer"]}
+    found = arm_curves(run(), "env_steps", "steps_taken", after)
+    assert [found[arm].x[0] for arm in EPOCHS] == [20_000, 120_000, 280_000]
+    drawn = lines(learning_curves(run(), after=after).axes[0])
+    styles = {name: line.get_linestyle() for name, line in drawn.items()}
+    assert styles == {"source": "--", "transfer": "--", "scratch": "-"}
+    assert len({line.get_color() for line in drawn.values()}) == 3
 
 
 def test_reference_levels_are_lines_with_names_that_do_not_overlap():
     bounds = {**BOUNDS, "best published": 13.0, "published transfer, IC3Net": 13.5}
-    figure = learning_curves(run(), bounds=bounds)
+    figure = curves(run(), bounds=bounds)
     for axes in figure.axes:
         levels = [
             line.get_ydata()[0] for line in axes.get_lines() if len(set(line.get_ydata())) == 1
@@ -136,9 +156,9 @@ def test_reference_levels_are_lines_with_names_that_do_not_overlap():
 
 
 def test_the_y_axis_is_logarithmic_where_that_helps():
-    assert learning_curves(run(), bounds=BOUNDS).axes[0].get_yscale() == "log"
-    assert learning_curves(run(), bounds=BOUNDS, log_y=False).axes[0].get_yscale() == "linear"
-    success = learning_curves(run(), y="success").axes[0]
+    assert curves(run(), bounds=BOUNDS).axes[0].get_yscale() == "log"
+    assert curves(run(), bounds=BOUNDS, log_y=False).axes[0].get_yscale() == "linear"
+    success = curves(run(), y="success").axes[0]
     assert success.get_yscale() == "linear"
     assert success.get_ylabel() == "success rate"
 
@@ -165,4 +185,4 @@ def test_the_png_has_its_size_and_no_global_figure_is_touched(tmp_path):
 
 def test_an_unknown_axis_is_refused():
     with pytest.raises(ValueError, match="env_steps, seconds"):
-        learning_curves(run(), x="epoch")
+        curves(run(), x="epoch")

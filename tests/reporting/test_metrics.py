@@ -32,7 +32,7 @@ def test_the_file_has_the_agreed_columns_and_a_row_per_arm_seed_and_epoch(tmp_pa
     lines = path.read_text().splitlines()
     assert lines[0] == (
         "arm,seed,epoch,env_steps,seconds,steps_taken,success,return,entropy,"
-        "policy_loss,value_loss,gradient_norm,communication"
+        "policy_loss,value_loss,gradient_norm,communication,cpu_seconds"
     )
     assert [line.split(",")[:4] for line in lines[1:]] == [
         ["source", "0", "1", "20000"],
@@ -44,7 +44,7 @@ def test_the_file_has_the_agreed_columns_and_a_row_per_arm_seed_and_epoch(tmp_pa
 
 def test_numbers_round_trip_in_the_precision_they_came_in(tmp_path):
     path = tmp_path / "metrics.csv"
-    numbers = np.random.default_rng(0).normal(size=9) * 10.0 ** np.arange(-20, 16, 4)
+    numbers = np.random.default_rng(0).normal(size=10) * 10.0 ** np.arange(-20, 20, 4)
     row = dict(zip(COLUMNS[4:], numbers, strict=True))
     double = {
         "arm": "source",
@@ -195,7 +195,7 @@ def test_the_comparison_is_that_of_target_steps_alone():
     assert alone["env_steps_to_threshold"] == {"transfer": [None, None], "scratch": []}
 
 
-def test_summary_json_has_the_agreed_form(tmp_path):
+def test_an_arm_of_summary_json_has_the_agreed_form(tmp_path):
     path = tmp_path / "summary.json"
     evaluation = metrics.evaluation_summary(
         1024, np.float32([14.5, np.nan]), [1.0, 0.0], [-2.0, -9]
@@ -208,24 +208,8 @@ def test_summary_json_has_the_agreed_form(tmp_path):
         sampled=evaluation,
         greedy=None,
     )
-    metrics.write_summary(
-        path,
-        experiment="pp_transfer",
-        policy="ic3net",
-        preset="fast",
-        seeds=range(2),
-        arms={"source": arm, "transfer": arm},
-        zero_shot=evaluation,
-        comparison=metrics.comparison([], 20.72),
-    )
-    summary = json.loads(path.read_text())
-    assert list(summary) == [
-        "experiment", "policy", "preset", "seeds", "source", "transfer", "scratch", "zero_shot",
-        "comparison",
-    ]  # fmt: skip
-    assert summary["scratch"] is None
-    assert summary["seeds"] == [0, 1]
-    assert summary["transfer"] == {
+    metrics.write_json(path, arm)
+    assert json.loads(path.read_text()) == {
         "env_steps": 2_500_000,
         "epochs": 125,
         "compile_seconds": 12.0,
@@ -241,6 +225,28 @@ def test_summary_json_has_the_agreed_form(tmp_path):
             "greedy": None,
         },
     }
+
+
+class TestFilesOfEarlierVersions:
+    """Without the column cpu_seconds."""
+
+    @pytest.fixture
+    def old(self, tmp_path):
+        path = tmp_path / "metrics.csv"
+        metrics.append_rows(path, chunk("source", 1, 2))
+        lines = [line.rpartition(",")[0] for line in path.read_text().splitlines()]
+        path.write_text("\n".join(lines) + "\n")
+        return path
+
+    def test_are_read(self, old):
+        rows = metrics.read_metrics(old)
+        assert [row["epoch"] for row in rows][-1] == 2
+        assert all(math.isnan(row["cpu_seconds"]) for row in rows)
+
+    def test_are_gone_on_with(self, old):
+        metrics.append_rows(old, chunk("source", 3, 1))
+        assert old.read_text().splitlines()[0] == ",".join(metrics.COLUMNS)
+        assert metrics.complete_epochs(metrics.read_metrics(old), "source") == 3
 
 
 def test_files_are_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
