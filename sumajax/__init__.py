@@ -7,6 +7,8 @@ from sumajax.learning import LearnerConfig, make_learner, preset
 from sumajax.policies import make_policy
 from sumajax.upsampling import StateUpsampled, upsample
 
+__version__ = "0.2.0"
+
 __all__ = [
     "LearnerConfig",
     "PredatorCapturePrey",
