@@ -19,6 +19,7 @@ from sumajax.learning.losses import LossFunction, LossParts, actor_critic
 from sumajax.learning.optimiser import annealed, learning_rate, make_optimiser
 from sumajax.learning.rollout import Actors, Draws, Trajectory, draw, last_value, rollout, start
 from sumajax.policies.types import Policy
+from sumajax.precision import stated_precision
 
 LOSSES: dict[str, LossFunction] = {"actor_critic": actor_critic, "hetnet": hetnet}
 """By `LearnerConfig.loss`."""
@@ -79,6 +80,7 @@ class Learner:
     Attributes:
       axis, shards: name and size of the device axis that the environments are spread over, inside
         `shard_map`; None and 1 when one device has them all.
+      unroll: steps of the rollout that one turn of its compiled loop takes.
     """
 
     env: Environment
@@ -86,6 +88,7 @@ class Learner:
     config: LearnerConfig
     axis: str | None = None
     shards: int = 1
+    unroll: int = 1
 
     def init(self, key: chex.PRNGKey) -> TrainState:
         """Fresh parameters, optimiser and environments."""
@@ -114,6 +117,7 @@ class Learner:
         state, tallies = jax.lax.scan(lambda s, _: self.update(s), state, length=updates)
         return state, summarise(jax.tree.map(lambda x: x.sum(0), tallies))
 
+    @stated_precision
     def update(self, state: TrainState) -> tuple[TrainState, Tally]:
         """One rollout and one optimiser step.
 
@@ -174,7 +178,7 @@ class Learner:
     ) -> tuple[chex.Array, tuple[Actors, Tally]]:
         config = self.config
         actors, trajectory = rollout(
-            self.env, self.policy, params, actors, draws, config.detach_gap
+            self.env, self.policy, params, actors, draws, config.detach_gap, self.unroll
         )
         if config.whole_episodes:
             valid = until_episode_end(trajectory, config.rollout_length)

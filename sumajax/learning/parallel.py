@@ -7,7 +7,8 @@ environments of each seed, and add up their gradients.
 import math
 import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import chex
@@ -23,6 +24,40 @@ from sumajax.learning.learner import Learner, Metrics, TrainState
 SEEDS, ENVS = "seeds", "envs"
 
 Train = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How a kind of device trains: what is computed stays the same to rounding.
+
+    Attributes:
+      together: all seeds side by side, every matrix product one batch of all seeds' products;
+        otherwise one seed after the other.
+      unroll: steps of the rollout that one turn of its compiled loop takes.
+    """
+
+    together: bool
+    unroll: int = 1
+
+
+EXECUTIONS = {"cpu": Execution(together=False)}
+"""By JAX's name of the platform, where it is not `ACCELERATOR`.
+
+A CPU's cores are full with one seed, whose arrays stay in their caches: four seeds of IC3Net side
+by side trained at TOGETHER_FIGURE of the speed of one after the other (benchmarks/README.md)."""
+ACCELERATOR = Execution(together=True)
+"""One seed's products are far too small to fill an accelerator: a step takes as long as starting
+its operations does, whatever the number of seeds."""
+
+
+def execution_on(platform: str) -> Execution:
+    """How devices of `platform` train, as "cpu" or "gpu"."""
+    return EXECUTIONS.get(platform, ACCELERATOR)
+
+
+def over_seeds(function: Callable[..., Any], execution: Execution) -> Callable[[Any], Any]:
+    """`function` of one seed's tree as a function of the trees stacked along a leading axis."""
+    return jax.vmap(function) if execution.together else partial(jax.lax.map, function)
 
 
 def use_cpu_devices(count: int) -> None:
@@ -96,18 +131,21 @@ def seed_keys(seeds: list[int]) -> chex.PRNGKey:
     return jnp.stack([jax.random.key(seed) for seed in seeds])
 
 
-def make_train(learner: Learner, mesh: Mesh, epochs: int) -> Train:
+def make_train(
+    learner: Learner, mesh: Mesh, epochs: int, execution: Execution | None = None
+) -> Train:
     """A jitted function from states stacked over seeds to the states `epochs` epochs later.
 
     The states given are used up. Metrics' leaves are (seeds, epochs).
+
+    Args:
+      execution: None: that of the mesh's kind of device.
     """
+    execution = execution or execution_on(mesh.devices.flat[0].platform)
     over_envs = mesh.shape[ENVS]
     axis = ENVS if over_envs > 1 else None
-    local = replace(learner, axis=axis, shards=over_envs)
-
-    def train(states: TrainState) -> tuple[TrainState, Metrics]:
-        return jax.lax.map(lambda state: local.train(state, epochs), states)
-
+    local = replace(learner, axis=axis, shards=over_envs, unroll=execution.unroll)
+    train = over_seeds(lambda state: local.train(state, epochs), execution)
     specs = state_specs()
     spread = jax.shard_map(
         train, mesh=mesh, in_specs=(specs,), out_specs=(specs, P(SEEDS)), check_vma=False
@@ -115,9 +153,17 @@ def make_train(learner: Learner, mesh: Mesh, epochs: int) -> Train:
     return jax.jit(spread, donate_argnums=0)
 
 
-def compile_train(learner: Learner, mesh: Mesh, epochs: int, states: TrainState) -> Train:
+def compile_train(
+    learner: Learner,
+    mesh: Mesh,
+    epochs: int,
+    states: TrainState,
+    execution: Execution | None = None,
+    compiler_options: dict[str, Any] | None = None,
+) -> Train:
     """`make_train` compiled ahead for `states`, so that its cost can be told apart."""
-    return make_train(learner, mesh, epochs).lower(states).compile()  # type: ignore[attr-defined]
+    lowered = make_train(learner, mesh, epochs, execution).lower(states)  # type: ignore[attr-defined]
+    return lowered.compile(compiler_options)
 
 
 def state_specs() -> Any:

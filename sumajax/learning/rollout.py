@@ -120,21 +120,26 @@ def rollout(
     actors: Actors,
     draws: Draws,
     detach_gap: int | None = None,
+    unroll: int = 1,
 ) -> tuple[Actors, Trajectory]:
     """T steps of E environments; ended episodes are followed by `draws.fresh` ones.
 
     Gradients reach `params` through the trajectory's logits and values, back through the agents'
     memory and messages to the start of the episode or of the segment, or over `detach_gap` steps.
+
+    Args:
+      unroll: steps that one turn of the compiled loop takes; changes no result.
     """
     if detach_gap is None:
-        actors, (_, trajectory) = play(env, policy, params, actors, draws)
+        actors, (_, trajectory) = play(env, policy, params, actors, draws, unroll)
         return actors, trajectory
-    actors, (before, trajectory) = play(env, policy, jax.lax.stop_gradient(params), actors, draws)
-    return actors, relive(env, policy, params, before, draws.noise, trajectory, detach_gap)
+    constant = jax.lax.stop_gradient(params)
+    actors, (before, trajectory) = play(env, policy, constant, actors, draws, unroll)
+    return actors, relive(env, policy, params, before, draws.noise, trajectory, detach_gap, unroll)
 
 
 def play(
-    env: Environment, policy: Policy, params: Any, actors: Actors, draws: Draws
+    env: Environment, policy: Policy, params: Any, actors: Actors, draws: Draws, unroll: int = 1
 ) -> tuple[Actors, tuple[Actors, Trajectory]]:
     """`rollout` without a gap; and the actors before each step, leaves (T, E, ...).
 
@@ -171,7 +176,7 @@ def play(
         )
         return following, (actors, step)
 
-    return jax.lax.scan(body, actors, draws)
+    return jax.lax.scan(body, actors, draws, unroll=unroll)
 
 
 def relive(
@@ -182,6 +187,7 @@ def relive(
     noise: Any,
     trajectory: Trajectory,
     gap: int,
+    unroll: int = 1,
 ) -> Trajectory:
     """`trajectory` with logits and values that gradients reach `params` through.
 
@@ -205,7 +211,8 @@ def relive(
         return carry, (logits, output.value)
 
     steps = pieces.split((begins, before, noise))
-    _, again = jax.lax.scan(body, policy.initial_carry(steps[0].shape[1:]), steps)
+    beginning = policy.initial_carry(steps[0].shape[1:])
+    _, again = jax.lax.scan(body, beginning, steps, unroll=unroll)
     logits, value = pieces.join(again)
     decisions = {
         name: replace(decision, logits=logits[name])

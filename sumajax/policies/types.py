@@ -17,6 +17,7 @@ from flax import linen as nn
 from flax import struct
 
 from sumajax.environments.types import Environment, Observation
+from sumajax.precision import stated_precision
 
 FOLDED = "folded"
 """Name of the variables that `Policy.prepare` adds to the parameters."""
@@ -175,6 +176,7 @@ class Policy:
         chex.assert_shape(obs.view, (..., *self.team.view_shape))
         return self.apply_with(params, carry, obs, self.sample_noise(key, obs.view.shape[:-4]))
 
+    @stated_precision
     def apply_with(
         self, params: Any, carry: Any, obs: Observation, noise: Any
     ) -> tuple[Any, PolicyOutput]:
@@ -182,15 +184,18 @@ class Policy:
         step = self.module.apply(params, carry, obs, noise, method=self.module.encode_and_step)
         return cast(tuple[Any, PolicyOutput], step)
 
+    @stated_precision
     def encode_states(self, params: Any, states: chex.Array) -> chex.Array:
         """(S, 1, rows, columns) -> (S, F), for `step`; cheapest for a NumPy array."""
         return self.module.apply(params, states, method=self.module.encode_states)
 
+    @stated_precision
     def prepare(self, params: Any) -> Any:
         """The parameters with all that does not change from step to step worked out, for `step`."""
         folded = self.module.apply(params, method=self.module.fold)
         return {**params, FOLDED: folded} if folded else params
 
+    @stated_precision
     def step(
         self, params: Any, carry: Any, state_features: chex.Array, view: chex.Array, noise: Any
     ) -> tuple[Any, PolicyOutput]:
