@@ -99,6 +99,8 @@ TASKS: dict[str, Environment] = {
     "pp-20x20-10p": PredatorPrey(20, 10, vision=1, max_steps=400),
 }
 SMALL_CASE = Case(task="pp-4x4-2p", seeds=2, envs=1000, rollout=20)
+SMALL_POLICY: dict[str, Any] = {"hidden": 8, "encoder": "linear"}
+"""Settings of the policy with `--small`: it compiles in seconds."""
 
 WIDE = [
     Case(seeds=1),
@@ -133,17 +135,25 @@ LOOP_GRAPHS = {"xla_gpu_enable_command_buffer": f"{_GRAPHS},CONDITIONAL,WHILE"}
 NO_GRAPHS = {"xla_gpu_enable_command_buffer": ""}
 
 
-def trials(seeds_together: Execution) -> list[Trial]:
-    """Other ways for the first row."""
-    five, whole = (replace(seeds_together, unroll=steps) for steps in (5, 10))
+def trials(plain: Execution) -> list[Trial]:
+    """Other ways for the first row, before the job."""
     return [
-        Trial("5 steps a turn", five),
-        Trial("no loop over steps", whole),
-        Trial("loops in CUDA graphs", seeds_together, LOOP_GRAPHS),
-        Trial("no CUDA graphs", seeds_together, NO_GRAPHS),
+        Trial("5 steps a turn", replace(plain, unroll=5)),
+        Trial("2 steps a turn", replace(plain, unroll=2)),
+        Trial("no CUDA graphs", plain, NO_GRAPHS),
+        Trial("TF32", plain, precision="tensorfloat32"),
+        Trial("seeds the other way", replace(plain, together=not plain.together)),
+    ]
+
+
+def later_trials(plain: Execution) -> list[Trial]:
+    """Those that take long to compile, or that a driver may not stand."""
+    five = replace(plain, unroll=5)
+    return [
+        Trial("no loop over steps", replace(plain, unroll=10)),
+        Trial("loops in CUDA graphs", plain, LOOP_GRAPHS),
         Trial("5 steps a turn, loops in CUDA graphs", five, LOOP_GRAPHS),
-        Trial("TF32", seeds_together, precision="tensorfloat32"),
-        Trial("one seed after the other", replace(seeds_together, together=False)),
+        Trial("5 steps a turn, TF32", five, precision="tensorfloat32"),
     ]
 
 
@@ -158,8 +168,8 @@ class Row:
     most: float
     compile_seconds: float
     compiled_beside: int  # other programs at the same time
-    launches_per_step: float  # rollout and way back
-    launches_per_update_step: float  # all of an update over its steps
+    launches_per_step: float | None  # rollout and way back; None where no loop is left
+    launches_per_update_step: float  # all of an update over its steps, all seeds
     unknown_loops: int  # loops whose turns the host has to count
     multiply_adds_per_step: float
     matrix_share: float
@@ -246,7 +256,8 @@ class Compiled:
 def learner_of(case: Case) -> Learner:
     env = TASKS[case.task]
     config = preset("fast", case.policy, num_envs=case.envs, rollout_length=case.rollout)
-    return make_learner(env, make_policy(case.policy, env), config)
+    small = SMALL_POLICY if case.task == SMALL_CASE.task else {}
+    return make_learner(env, make_policy(case.policy, env, **small), config)
 
 
 def one_device(learner: Learner, seeds: int) -> Mesh:
@@ -279,13 +290,16 @@ def timed(ready: Compiled) -> list[float]:
     return rates
 
 
-def launches(program: Loop, case: Case) -> tuple[float, float]:
+def launches(program: Loop, case: Case) -> tuple[float | None, float]:
     """Per step of the rollout: of both scans' bodies, and of the whole update."""
-    loops = list(program.all_loops())
-    scans = [loop for loop in loops if loop.products and not loop.inner][-2:]
-    per_step = sum((loop.turns or 1) * loop.launches for loop in scans) / case.rollout
+    scans = [
+        loop
+        for loop in program.all_loops()
+        if loop.products and not loop.inner and 1 < (loop.turns or 1) <= case.rollout
+    ]
+    both = sum((loop.turns or 1) * loop.launches for loop in scans) / case.rollout
     updates = EPOCH_STEPS / (case.envs * case.rollout)
-    return per_step, program.launches / updates / case.rollout
+    return both or None, program.launches / updates / case.rollout
 
 
 def measured(ready: Compiled, matrix_rates: dict[str, float], beside: int) -> Row:
@@ -324,7 +338,7 @@ def shown(row: Row) -> dict[str, str]:
         "steps/s (least-most)": f"{row.env_steps_per_second:,.0f} "
         f"({row.least:,.0f}-{row.most:,.0f})",
         "share": f"{row.matrix_share:.1%}",
-        "launches a step, of all": f"{row.launches_per_step:.0f}, "
+        "launches a step, of all": f"{row.launches_per_step or float('nan'):.0f}, "
         f"{row.launches_per_update_step:.0f}",
         "compile s (beside)": f"{row.compile_seconds:.1f} ({row.compiled_beside})",
         "GB": f"{row.memory_gb:.2f}",
@@ -347,7 +361,10 @@ def in_batches(
         wait(futures, timeout=max(report.left, 0))
         pool.shutdown(wait=False, cancel_futures=True)
         longest = max(longest, time.perf_counter() - began)
-        for future in (future for future in futures if future.done()):
+        for future in futures:
+            if not future.done() or future.cancelled():
+                yield TimeoutError("not compiled in time"), len(batch) - 1
+                continue
             error = future.exception()
             yield (error if error is not None else future.result()), len(batch) - 1
 
@@ -357,13 +374,15 @@ def measure(
 ) -> list[tuple[Row, Trial]]:
     """Rows of `wanted`, each in the files as soon as it is there."""
     rows = []
-    for ready, beside in in_batches(report, wanted):
+    for (case, trial), (ready, beside) in zip(wanted, in_batches(report, wanted), strict=False):
         try:
             if isinstance(ready, BaseException):
                 raise ready
             row = measured(ready, rates, beside)
         except Exception as error:  # out of memory, or an option XLA does not know: the next row
-            report.note(f"failed_{len(report.content)}", f"{type(error).__name__}: {error}"[:300])
+            failed = report.content.get("failed", [])
+            told = f"{trial.name}: {type(error).__name__}: {error}"
+            report.note("failed", [*failed, {**asdict(case), "why": told[:300]}])
             continue
         rows.append((row, ready.trial))
         report.add(key, asdict(row), shown(row))
@@ -405,8 +424,8 @@ def prepared(leg: Leg, seeds: list[int], trial: Trial, episodes: int) -> ReadyLe
     options = trial.options or None
     train = parallel.compile_train(leg.learner, mesh, chunk, states, trial.execution, options)
     greedy = jnp.zeros(len(seeds), bool)
-    tested = jax.jit(held_out(leg.learner, trial.execution, episodes))
-    return ReadyLeg(leg, chunk, states, train, tested.lower(states.params, greedy).compile())
+    evaluate_all = jax.jit(held_out(leg.learner, trial.execution, episodes))
+    return ReadyLeg(leg, chunk, states, train, evaluate_all.lower(states.params, greedy).compile())
 
 
 def held_out(
@@ -423,7 +442,7 @@ def held_out(
     return lambda params, greedy: all_seeds((params, greedy))
 
 
-def tested(ready: ReadyLeg, params: Any) -> dict[str, dict[str, Any]]:
+def held_out_figures(ready: ReadyLeg, params: Any) -> dict[str, dict[str, Any]]:
     """Held-out figures of every seed, sampled and greedy."""
     num_seeds, figures = jax.tree.leaves(params)[0].shape[0], {}
     for name, greedy in (("sampled", False), ("greedy", True)):
@@ -452,11 +471,11 @@ def run_legs(report: Report, legs: list[Leg], options: "Options", trial: Trial) 
         leg, states = each.leg, each.states
         if leg.follows is not None:
             states = replace(states, params=jax.tree.map(jnp.copy, params[leg.follows]))
-        before = tested(each, states.params) if options.before else None
+        before = held_out_figures(each, states.params)
         states, epochs, seconds = train_leg(report, each, states, seeds)
         params[leg.name] = states.params
         save_params(report.output / f"{leg.name}.npz", states.params)
-        after = tested(each, states.params)
+        after = held_out_figures(each, states.params)
         steps = epochs * len(seeds) * EPOCH_STEPS
         told = {
             "leg": leg.name,
@@ -476,8 +495,6 @@ def shown_leg(told: dict[str, Any]) -> dict[str, str]:
     """A line of the job's table."""
 
     def figure(when: str, how: str) -> str:
-        if told[when] is None:
-            return "-"
         it = told[when][how]
         return f"{it['steps_taken']:.2f} ({it['least']:.2f}-{it['most']:.2f})"
 
@@ -533,17 +550,17 @@ def main_job(options: "Options") -> list[Leg]:
     """Source on 5x5 at 10x10, transfer and scratch on 10x10; with `--small` on 2x2 and 4x4."""
     if options.small:
         small, large = PredatorPrey(2, 2, vision=1, max_steps=10), TASKS["pp-4x4-2p"]
-        config = {"num_envs": 1000, "rollout_length": 20}
+        config, shape = {"num_envs": 1000, "rollout_length": 20}, SMALL_POLICY
     else:
         small, large = PredatorPrey(5, 3, vision=1, max_steps=80), TASKS["pp-10x10-5p"]
-        config = {}
+        config, shape = {}, {}
     first, then = options.epochs[:2] if options.epochs else ((1, 1) if options.small else (40, 80))
     source, target = StateUpsampled(small, large.state_shape[1:]), large
     settings = preset("fast", "ic3net", **config)
     gentle = replace(settings, learning_rate=settings.learning_rate * settings.transfer_rate)
 
     def learner(env: Environment, config: Any) -> Learner:
-        return make_learner(env, make_policy("ic3net", env), config)
+        return make_learner(env, make_policy("ic3net", env, **shape), config)
 
     return [
         Leg("source", learner(source, settings), first),
@@ -566,9 +583,8 @@ def chain_job(options: "Options") -> list[Leg]:
         if size != options.sizes[-1]:
             task = StateUpsampled(task, options.sizes[-1])
         rate = settings.learning_rate * (settings.transfer_rate if i else 1.0)
-        learner = make_learner(
-            task, make_policy(options.policy, task), replace(settings, learning_rate=rate)
-        )
+        policy = make_policy(options.policy, task, **(SMALL_POLICY if options.small else {}))
+        learner = make_learner(task, policy, replace(settings, learning_rate=rate))
         follows = legs[-1].name if legs else None
         legs.append(Leg(f"stage{i + 1}-{size}x{size}", learner, options.epochs[i], follows))
     return legs
@@ -593,7 +609,7 @@ class Options:
     settings: dict[str, Any] = field(default_factory=dict)
     unroll: int | None = None
     xla: dict[str, Any] = field(default_factory=dict)
-    before: bool = True
+    cache: Path | None = None
 
     def __post_init__(self) -> None:
         if (self.output / "accelerator.json").exists():
@@ -642,6 +658,7 @@ def parsed(arguments: list[str] | None = None) -> Options:
     add("--settings", type=setting, nargs="+", default=[], help="of a chain's learner, NAME=VALUE")
     add("--unroll", type=int, help="steps in a turn of the rollout's loop; the backend's own")
     add("--xla", type=setting, nargs="+", default=[], help="options of XLA's, NAME=VALUE")
+    add("--cache", type=Path, help="directory of compiled programs; compiled in the output")
     given = parser.parse_args(arguments)
     lists = {
         name: tuple(getattr(given, name))
@@ -658,6 +675,7 @@ def parsed(arguments: list[str] | None = None) -> Options:
         settings=dict(given.settings),
         unroll=given.unroll,
         xla=dict(given.xla),
+        cache=given.cache,
         **lists,
     )
 
@@ -669,7 +687,7 @@ def table(report: Report, options: Options, plain: Trial) -> Trial:
     report.note("matrix_rate", rates)
     first = SMALL_CASE if options.small else Case()
     others = trials(plain.execution)
-    others = others[:1] if options.small else others
+    others = others[-1:] if options.small else others
     rows = measure(report, "rows", [(first, plain)], rates)
     rows += measure(report, "rows", [(first, trial) for trial in others], rates)
     best = fastest(rows, plain)
@@ -680,9 +698,6 @@ def table(report: Report, options: Options, plain: Trial) -> Trial:
 def main(options: Options) -> dict[str, Any]:
     """Runs what is asked; what was written, as a dictionary."""
     options.output.mkdir(parents=True, exist_ok=True)
-    cache = options.output / "compiled"
-    jax.config.update("jax_compilation_cache_dir", str(cache.resolve()))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     report = Report(options.output, options.seconds)
     execution = parallel.execution_on(platform())
     if options.unroll is not None:
@@ -701,12 +716,21 @@ def main(options: Options) -> dict[str, Any]:
     if options.job == "chain":
         run_legs(report, chain_job(options), options, plain)
     if options.job in ("all", "table"):
-        rest = [replace(SMALL_CASE, seeds=1)] if options.small else ROWS
-        rates = report.content["matrix_rate"]
-        measure(report, "rows", [(case, best) for case in rest], rates)
+        rest = [
+            (case, best) for case in ([replace(SMALL_CASE, seeds=1)] if options.small else ROWS)
+        ]
+        if not options.small:
+            rest[COMPILING:COMPILING] = [(Case(), trial) for trial in later_trials(execution)]
+        measure(report, "rows", rest, report.content["matrix_rate"])
     stats = jax.devices()[0].memory_stats() or {}
     report.note("peak_memory_gb", stats.get("peak_bytes_in_use", 0) / 2**30)
     return report.content
+
+
+def keep_compiled(directory: Path) -> None:
+    """Compiled programs stay there: a second try begins sooner."""
+    jax.config.update("jax_compilation_cache_dir", str(directory.resolve()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 
 def end_after(seconds: float) -> None:
@@ -724,6 +748,7 @@ def end_after(seconds: float) -> None:
 if __name__ == "__main__":
     asked = parsed()
     end_after(asked.seconds)
+    keep_compiled(asked.cache or asked.output / "compiled")
     main(asked)
     sys.stdout.flush()
     os._exit(0)  # a program may still be compiling, beyond the last row there was time for

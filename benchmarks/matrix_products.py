@@ -11,16 +11,18 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Jaxpr, JaxprEqn
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from sumajax.environments.types import Environment
 from sumajax.policies import Policy
+
+if TYPE_CHECKING:  # of an interface that may move
+    from jax.extend.core import Jaxpr, JaxprEqn
 
 TRAINING = 3
 """Products of training for each of the forward pass: itself, and one for each of its operands."""
@@ -63,7 +65,7 @@ def step_products(env: Environment, policy: Policy, num_envs: int) -> Counter[Pr
     return products(policy.step, params, carry, mine, view, noise)
 
 
-def _gather(jaxpr: Jaxpr, times: int = 1) -> Iterator[tuple[Product, int]]:
+def _gather(jaxpr: "Jaxpr", times: int = 1) -> Iterator[tuple[Product, int]]:
     found: Counter[Product] = Counter()
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
@@ -75,7 +77,7 @@ def _gather(jaxpr: Jaxpr, times: int = 1) -> Iterator[tuple[Product, int]]:
     yield from found.items()
 
 
-def _jaxprs(value: Any) -> Iterator[Jaxpr]:
+def _jaxprs(value: Any) -> "Iterator[Jaxpr]":
     """The programs inside an equation's parameter: bodies of loops, of calls, of branches."""
     for part in value if isinstance(value, tuple | list) else (value,):
         if hasattr(part, "eqns"):
@@ -84,7 +86,7 @@ def _jaxprs(value: Any) -> Iterator[Jaxpr]:
             yield part.jaxpr
 
 
-def _product(equation: JaxprEqn) -> Product:
+def _product(equation: "JaxprEqn") -> Product:
     (contract_left, contract_right), (batch_left, batch_right) = equation.params[
         "dimension_numbers"
     ]

@@ -5,7 +5,7 @@ because it flattens; `lab_gap` is the encoder of the authors' later public branc
 the grid and so cannot tell most inner cells of a native grid apart; `linear` has no convolution.
 """
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import chex
 import jax.numpy as jnp
@@ -35,8 +35,10 @@ def patches(
     """(..., rows, columns, c) -> (..., rows', columns', kernel^2 c): what a convolution looks at.
 
     A convolution written as one product with these is a matrix product, forwards and back; XLA's
-    own convolutions of a few channels took four times as long on a CPU.
+    own convolutions of a few channels took four times as long on a CPU. Of a NumPy array they are
+    one too, and nothing is compiled for them.
     """
+    xp: Any = np if isinstance(x, np.ndarray) else jnp
     out = []
     for axis in (-3, -2):
         side = x.shape[axis]
@@ -44,9 +46,9 @@ def patches(
         missing = max((steps - 1) * stride + kernel - side, 0)
         widths = [(0, 0)] * x.ndim
         widths[axis] = (missing // 2, missing - missing // 2)
-        x = jnp.pad(x, widths) if missing else x
+        x = xp.pad(x, widths) if missing else x
         out.append((steps - 1) * stride + 1)
-    return jnp.concatenate(
+    return xp.concatenate(
         [
             x[..., a : a + out[0] : stride, b : b + out[1] : stride, :]
             for a in range(kernel)

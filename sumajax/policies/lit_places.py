@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import chex
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -31,10 +30,9 @@ Patches = Callable[[chex.Array], chex.Array]
 
 def lit_places(states: np.ndarray, first: Patches, second: Patches) -> LitPlaces:
     """The places of `second` after `first` at which states (S, rows, columns, 1) are not empty."""
-    with jax.ensure_compile_time_eval():
-        once = np.asarray(first(states))
-        seen = np.asarray(second(once))
-        exists = np.asarray(second(jnp.ones((1, *once.shape[1:3], 1))))
+    once = np.asarray(first(states))
+    seen = np.asarray(second(once))
+    exists = np.asarray(second(np.ones((1, *once.shape[1:3], 1), states.dtype)))
     num_states, inputs = len(states), once.shape[-1]
     seen = np.moveaxis(seen.reshape(num_states, -1, seen.shape[-1] // inputs, inputs), 0, 1)
     lit = (seen != 0).any((-1, -2))  # (P, S)
