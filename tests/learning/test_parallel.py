@@ -37,6 +37,43 @@ def test_several_seeds_are_each_alone():
         jax.tree.map(close, *jax.tree.map(raw, (alone, together)))
 
 
+@pytest.mark.parametrize("policy", ["ic3net", "magic", "hetnet"])
+def test_seeds_side_by_side_learn_what_they_learn_one_after_the_other(policy):
+    learner = tiny_learner(TINY_TASK, policy, num_envs=200, rollout_length=20)
+    mesh = parallel.make_mesh(len(SEEDS), 200, devices=1)
+    ways = []
+    for together, unroll in ((False, 1), (True, 4)):
+        states = parallel.place(parallel.init_seeds(learner, SEEDS), mesh)
+        way = parallel.Execution(together, unroll)
+        ways.append(parallel.make_train(learner, mesh, 1, way)(states))
+    close = partial(np.testing.assert_allclose, rtol=1e-3, atol=2e-5)
+    jax.tree.map(close, *jax.tree.map(raw, [states.params for states, _ in ways]))
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3), *(metrics for _, metrics in ways))
+
+
+def test_seeds_side_by_side_share_every_product():
+    """One batch for all seeds where one seed has one product, and no loop over seeds."""
+    learner = tiny_learner(TINY_TASK, "ic3net", num_envs=200, rollout_length=20)
+    mesh, found = parallel.make_mesh(3, 200, devices=1), []
+    for num_seeds, together in ((1, False), (3, True)):
+        states = jax.eval_shape(lambda n=num_seeds: parallel.init_seeds(learner, list(range(n))))
+        train = parallel.make_train(learner, mesh, 1, parallel.Execution(together))
+        program = train.lower(states).as_text()
+        products = [line for line in program.splitlines() if "stablehlo.dot_general" in line]
+        found.append((program.count("stablehlo.while"), len(products)))
+        of_weights = [line for line in products if "contracting_dims = [1] x [0]" not in line]
+        if together:
+            assert all("batching_dims = [0" in line for line in of_weights)
+    alone, side_by_side = found
+    assert side_by_side == (alone[0] - 1, alone[1])
+
+
+def test_a_cpu_trains_seeds_one_after_the_other_and_an_accelerator_side_by_side():
+    assert not parallel.execution_on("cpu").together
+    assert parallel.execution_on("gpu").together
+    assert parallel.execution_on("tpu").together
+
+
 @pytest.fixture(scope="module")
 def two_devices():
     script = Path(__file__).with_name("two_devices.py")
