@@ -14,8 +14,8 @@ bounded. One program at a time may write to a directory; any number may read.
 """
 
 from sumajax.checkpoint.format import DESCRIPTION, MAX_DESCRIPTION_BYTES, MAX_STATE_BYTES
-from sumajax.checkpoint.reading import latest, load, load_params, read_meta
-from sumajax.checkpoint.writing import save
+from sumajax.checkpoint.reading import identity, latest, load, load_params, read_meta
+from sumajax.checkpoint.writing import check_directory, save
 from sumajax.description import CheckpointError, check_compatible, describe, rebuild
 
 __all__ = [
@@ -24,7 +24,9 @@ __all__ = [
     "MAX_STATE_BYTES",
     "CheckpointError",
     "check_compatible",
+    "check_directory",
     "describe",
+    "identity",
     "latest",
     "load",
     "load_params",
