@@ -19,7 +19,7 @@ from flax import linen as nn
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.environments.types import Environment
-from sumajax.plain import ARRAYS, plain
+from sumajax.plain import is_values, plain
 from sumajax.policies import POLICIES, Policy, make_policy
 from sumajax.upsampling import StateUpsampled
 
@@ -209,9 +209,9 @@ def _class_name(cls: Any, known: dict[str, Any]) -> str:
 
 def _json(value: Any) -> Any:
     """`value` as JSON; of what JSON cannot say only a name that is the same in the next program."""
-    if isinstance(value, ARRAYS) and value.size > MAX_ITEMS:
-        return _described_array(np.asarray(value))
     value = plain(value)
+    if is_values(value):
+        return value.tolist() if value.size <= MAX_ITEMS else _described_array(np.asarray(value))
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, (list, tuple)):

@@ -18,12 +18,12 @@ def plain(value: Any) -> Any:
     """`value` with every number, truth value and text in it as Python's own.
 
     Integral and real numbers become `int` and `float` of the same value, `np.bool_` becomes `bool`,
-    `np.str_` becomes `str`, an array what it holds: a number if it has no axes, else nested tuples.
-    Tuples, lists and dictionaries are gone through; everything else stays as it is, so that who
-    checks it can name what was given.
+    `np.str_` becomes `str`, an array without axes the value it holds. Tuples, lists and
+    dictionaries are gone through; everything else stays as it is, so that who checks it can name
+    what was given.
     """
-    if isinstance(value, ARRAYS) and not isinstance(value, jax.core.Tracer):
-        value = _python_value(value)
+    if is_values(value) and value.ndim == 0:
+        value = value.tolist()
     if value is None or isinstance(value, bool):
         return value
     if isinstance(value, str):
@@ -46,16 +46,9 @@ def plain_fields(config: Any) -> None:
             object.__setattr__(config, field.name, plain(getattr(config, field.name)))
 
 
-def _python_value(array: Any) -> Any:
-    """Of an array of numbers or text; other arrays stay, as PRNG keys do."""
-    try:
-        array = np.asarray(array)
-    except TypeError:
-        return array
-    if array.dtype.kind not in "biufU" and array.dtype.name != "bfloat16":
-        return array
-    return _nested_tuples(array.tolist())
-
-
-def _nested_tuples(value: Any) -> Any:
-    return tuple(map(_nested_tuples, value)) if isinstance(value, list) else value
+def is_values(value: Any) -> bool:
+    """Whether it is an array of numbers, truth values or text, and no traced one, and no key."""
+    if not isinstance(value, ARRAYS) or isinstance(value, jax.core.Tracer):
+        return False
+    kind = value.dtype.kind if isinstance(value.dtype, np.dtype) else "key"
+    return kind in "biufU" or value.dtype == jax.numpy.bfloat16

@@ -33,7 +33,7 @@ from sumajax.checkpoint.leaves import array_digest, host_arrays
 from sumajax.checkpoint.orbax import save_arrays
 from sumajax.checkpoint.reading import restore
 from sumajax.description import CheckpointError, reason
-from sumajax.plain import plain
+from sumajax.plain import is_values, plain
 
 ROOM, ROOM_PER_LEAF, ROOM_SHARE = 128 * 2**10, 2**10, 1 / 256
 """Bytes on disk beside the values: folders and part-filled blocks; the description of a leaf;
@@ -67,9 +67,8 @@ def save(
       CheckpointError: for a directory that is a checkpoint itself or cannot be written, a full
         disk, a leaf that is no array, a `meta` that is no JSON, what cannot be read back.
     """
-    meta = plain(meta)
     try:
-        json.dumps(meta)
+        meta = json.loads(json.dumps(plain(meta), default=_listed))
         step = meta.get("epoch", 0) if step is None else plain(step)
     except (TypeError, ValueError, RecursionError, AttributeError) as error:
         raise CheckpointError(f"meta must be a dictionary of JSON: {reason(error)}.") from error
@@ -93,6 +92,13 @@ def save(
     for old in earlier[keep - 1 :]:
         discard(old)
     return final
+
+
+def _listed(value: Any) -> Any:
+    """Of an array; what else JSON cannot say, it is to refuse."""
+    if not is_values(value):
+        raise TypeError(f"{type(value).__name__} is no JSON")
+    return value.tolist()
 
 
 def check_directory(directory: str | os.PathLike[str]) -> None:

@@ -31,6 +31,7 @@ def grid_size(size: int | tuple[int, int], name: str = "size") -> tuple[int, int
       ValueError: for anything but one or two positive whole numbers.
     """
     given = plain(size)
+    given = given.tolist() if isinstance(given, np.ndarray) else given
     sides = tuple(given) if isinstance(given, (tuple, list)) else (given, given)
     whole = all(isinstance(side, int) and not isinstance(side, bool) for side in sides)
     if not whole or len(sides) != 2 or min(sides) < 1:

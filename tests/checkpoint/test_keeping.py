@@ -1,6 +1,8 @@
 """Which checkpoints of a directory stay, and what is refused before anything is written."""
 
 import os
+import shutil
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from refusals import refusal
 from saved_states import META, train_state
 
-from sumajax.checkpoint import latest, load, load_params, read_meta, reading, save
+from sumajax.checkpoint import identity, latest, load, load_params, read_meta, reading, save
 
 
 class TestKeeping:
@@ -54,6 +56,35 @@ class TestKeeping:
     ):
         assert words in refusal(save, tmp_path / "c", state, meta)
         assert not (tmp_path / "c").exists()
+
+
+class TestIdentity:
+    def test_is_of_the_content_and_not_of_the_place(self, damaged, tmp_path):
+        before = identity(damaged)
+        moved = Path(shutil.copytree(damaged, tmp_path / "elsewhere"))
+        assert identity(moved) == identity(latest(moved)) == before
+        shutil.rmtree(moved / "000001-step-1")
+        assert identity(moved) == before
+
+    def test_changes_with_what_is_saved(self, damaged):
+        before = identity(damaged)
+        after = [
+            identity(damaged)
+            for state, meta in (
+                (train_state(2), {"epoch": 3}),
+                (train_state(3), {"epoch": 2}),
+            )
+            if save(damaged, state, meta)
+        ]
+        assert len({before, *after}) == 3
+
+    def test_is_of_the_newest_good_one(self, damaged):
+        before = identity(damaged)
+        earlier = identity(damaged / "000001-step-1")
+        (latest(damaged) / "state" / "state" / "manifest.ocdbt").unlink()
+        said: list[str] = []
+        assert identity(damaged, say=said.append) == earlier != before
+        assert "going on from the earlier" in said[0]
 
 
 class TestDifferentState:

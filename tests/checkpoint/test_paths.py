@@ -141,21 +141,19 @@ class TestRefused:
 
     def test_a_path_just_too_long_for_the_files_in_it(self, tmp_path):
         """At every length where it begins to be too long: works and can be read, or is refused."""
-        outcomes = []
+        refusals = []
         base = tmp_path / "/".join(["x" * 200] * ((3800 - len(str(tmp_path))) // 201))
         for length in (3850, 3910, 3940, 3970, 4050):
             directory = base / ("y" * (length - len(str(base)) - 1))
             try:
                 check_directory(directory)
             except CheckpointError as error:
-                assert "too long" in str(error)
-                outcomes.append("refused")
+                refusals.append(str(error))
                 continue
             save(directory, STATE, META, step=10**17)
             load(directory, STATE, say=pytest.fail)
-            outcomes.append("works")
-        assert outcomes[0] == "works"
-        assert outcomes[-1] == "refused"
+        assert 1 <= len(refusals) <= 4
+        assert all("too long" in sentence for sentence in refusals)
 
     def test_a_file_and_a_folder_that_cannot_be_written(self, tmp_path):
         (tmp_path / "file").write_text("mine")
