@@ -25,7 +25,7 @@ def stated_precision(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def stated(*args: P.args, **kwargs: P.kwargs) -> T:
-        asked = jax.config.jax_default_matmul_precision
+        asked = jax.config.jax_default_matmul_precision  # type: ignore[attr-defined]
         with jax.default_matmul_precision(asked or MATRIX_PRECISION):
             return function(*args, **kwargs)
 

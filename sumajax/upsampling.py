@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 
 from sumajax.environments.grid import grid_size, plain_size
 from sumajax.environments.types import Environment, Observation, Transition
+from sumajax.plain import plain_fields
 
 Scale = Literal["none", "mass"]
 Fill = Literal["blocks", "corner"]
@@ -54,6 +55,7 @@ class StateUpsampled:
     fill: Fill = "blocks"
 
     def __post_init__(self) -> None:
+        plain_fields(self)
         object.__setattr__(self, "size", plain_size(self.size))
         for name, choices in (("scale", get_args(Scale)), ("fill", get_args(Fill))):
             value = getattr(self, name)

@@ -1,13 +1,16 @@
 """Tasks and policies described, compared and rebuilt."""
 
+import dataclasses
+import importlib.metadata
 import json
 from typing import Any
 
 import jax
+import numpy as np
 import pytest
 from refusals import refusal
 
-from sumajax.description import check_compatible, describe, rebuild
+from sumajax.description import check_compatible, describe, rebuild, versions
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.policies import POLICIES, Policy, TeamSpec, make_policy
 from sumajax.policies.ic3net import IC3Net
@@ -90,9 +93,6 @@ def test_a_description_of_nothing():
 
 
 def test_a_policy_of_your_own_is_described_and_not_taken_for_one_of_ours():
-    class Mine(IC3Net):
-        activation: Any = jax.nn.relu
-
     env = PredatorPrey(5)
     mine = Policy("ic3net", Mine(TeamSpec.of(env)))
     meta = json.loads(json.dumps(describe(env, mine)))
@@ -100,6 +100,81 @@ def test_a_policy_of_your_own_is_described_and_not_taken_for_one_of_ours():
     assert "0x" not in json.dumps(meta)
     assert "load_params" in refusal(rebuild, meta)
     check_compatible(meta, env, mine)
+
+
+@dataclasses.dataclass(frozen=True)
+class Wind:
+    strength: Any
+    gusts: tuple[float, ...] = (0.5, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Windy(PredatorPrey):
+    """A domain of one's own, with settings of its own."""
+
+    wind: Any = None
+    rates: Any = None
+    table: Any = None
+    rule: Any = jax.nn.relu
+
+
+class Mine(IC3Net):
+    activation: Any = jax.nn.relu
+    wind: Any = None
+
+
+def test_a_task_of_your_own_is_described_in_plain_words_and_compared():
+    wind = Wind(np.float32(0.5))
+    table = np.zeros((100, 100), np.int8)
+    env = Windy(5, wind=wind, rates={"a": np.int64(3)}, table=table)
+    policy = Policy("mine", Mine(TeamSpec.of(env), wind=wind))
+    meta = json.loads(json.dumps(describe(env, policy)))
+    assert meta == json.loads(json.dumps(describe(env, policy)))
+    assert meta["task"]["class"].endswith("test_description.Windy")
+    fields = meta["task"]["fields"]
+    gusty = {"strength": 0.5, "gusts": [0.5, 1.0]}
+    assert fields["wind"]["class"].endswith("test_description.Wind")
+    assert fields["wind"]["fields"] == gusty
+    assert fields["rates"] == {"a": 3}
+    assert (fields["table"]["shape"], fields["table"]["dtype"]) == ([100, 100], "int8")
+    assert fields["rule"].endswith("relu")
+    assert meta["policy"]["settings"]["wind"]["fields"] == gusty
+    assert "0x" not in json.dumps(meta)
+
+    for unknown in (meta, {**meta, "task": describe(ENVS[0], policy)["task"]}):
+        sentence = refusal(rebuild, unknown)
+        assert "pass env=... and policy=... to load_agent" in sentence
+    check_compatible(meta, env, policy)
+    other = Policy("mine", Mine(TeamSpec.of(env), wind=Wind(0.75)))
+    sentence = refusal(check_compatible, meta, env, other, "runs/x", here="what you gave")
+    assert "policy setting wind differs" in sentence
+    assert "in what you gave" in sentence
+
+
+def test_a_task_that_is_no_dataclass_is_known_by_its_name():
+    class Plain:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(ENVS[0], name)
+
+    meta = describe(Plain(), make_policy("ic3net", ENVS[0]))
+    assert meta["task"]["class"].endswith("Plain")
+    assert "load_agent" in refusal(rebuild, meta)
+
+
+def test_versions_of_a_package_that_is_not_installed(monkeypatch):
+    """A clone on the path has no distribution metadata."""
+
+    def version(name: str) -> str:
+        if name == "sumajax":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    found = versions()
+    assert found["sumajax"] == "unknown"
+    assert {"python", "jax", "flax", "optax", "orbax-checkpoint", "numpy"} <= found.keys()
+    env = ENVS[0]
+    assert describe(env, make_policy("ic3net", env))["versions"] == found
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Checkpoints: the state of a run on disk, written and read by Orbax in this one place.
+"""Checkpoints: the state of a run on disk, its arrays written and read by Orbax.
 
 A checkpoint directory holds the last few checkpoints of one training run, each a directory of its
 own that is complete or absent, never half there:
@@ -9,13 +9,25 @@ own that is complete or absent, never half there:
 
 `checkpoint.json` gives the shape, dtype and SHA-256 of every leaf and the size and SHA-256 of every
 file, and is itself under a checksum, so whatever was truncated, altered or lost is found before
-anything is trained on. Reading executes nothing from the directory, unpickles nothing, and is
-bounded. One program at a time may write to a directory; any number may read.
+anything is trained on. What it does not list was written by others and is ignored; what it lists
+may be links to files elsewhere. A save counts only once it has been read back as a loader would.
+Reading executes nothing from the directory, unpickles nothing, and is bounded. One program at a
+time may write to a directory; any number may read.
+
+Orbax has a `Checkpointer` that names, keeps and removes a sequence of checkpoints. It is not used:
+it gives a checkpoint its name within the save, before digests can be added to it or anybody has
+read it, and removes the one before it on that ground; it removes in place, so that a kill leaves
+half a checkpoint under the name of a whole one; after going back to an earlier good checkpoint it
+silently saves nothing until the step of the damaged one is passed; and it does not put values onto
+the disk itself (fsync). tests/checkpoint/test_orbax_checkpointer.py shows the first three.
+
+`format` says what is on disk, `leaves` how a state has names, `files` what is verified, `directory`
+which checkpoints there are, `writing` and `reading` do it, `orbax` is all that knows Orbax.
 """
 
 from sumajax.checkpoint.format import DESCRIPTION, MAX_DESCRIPTION_BYTES, MAX_STATE_BYTES
 from sumajax.checkpoint.reading import identity, latest, load, load_params, read_meta
-from sumajax.checkpoint.writing import save
+from sumajax.checkpoint.writing import check_directory, save
 from sumajax.description import CheckpointError, check_compatible, describe, rebuild
 
 __all__ = [
@@ -24,6 +36,7 @@ __all__ = [
     "MAX_STATE_BYTES",
     "CheckpointError",
     "check_compatible",
+    "check_directory",
     "describe",
     "identity",
     "latest",

@@ -2,45 +2,59 @@
 
 import os
 import re
-import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from sumajax.checkpoint.files import remove
 from sumajax.checkpoint.format import DESCRIPTION, DamagedError
 from sumajax.description import CheckpointError, reason
 
 NAME = re.compile(r"(\d{6,12})-step-(\d{1,18})")
 SCRATCH = ".unfinished-"
+"""Before the name that an unfinished checkpoint will have, and one to be removed has had."""
+ORBAX_MARK = "_CHECKPOINT_METADATA"
+"""A file that Orbax puts into each of its checkpoints."""
 
 
 T = TypeVar("T")
 
 
 def claim(root: Path) -> Path:
-    """`root` as a directory that is ours to write in, unfinished saves of a killed run removed."""
+    """`root` as a directory to write checkpoints in, made if missing; what is in it stays.
+
+    Files of others beside the checkpoints are ignored. What is a checkpoint itself is refused.
+    """
     try:
         root.mkdir(parents=True, exist_ok=True)
-        entries = os.listdir(root)
-        if entries and not any(_is_ours(entry) for entry in entries):
-            raise CheckpointError(
-                f"{root} holds other things than checkpoints ({sorted(entries)[0]}); choose a new "
-                "or empty directory."
-            )
-        for entry in entries:
-            if entry.startswith(SCRATCH):
-                shutil.rmtree(root / entry)
-    except OSError as error:
+        for mark in (DESCRIPTION, ORBAX_MARK):
+            if (root / mark).exists():
+                raise CheckpointError(
+                    f"{root} is not a directory for checkpoints but one itself (it holds {mark}); "
+                    "choose another directory."
+                )
+        return root.resolve()
+    except (OSError, ValueError) as error:
+        if isinstance(error, CheckpointError):
+            raise
         raise CheckpointError(
             f"checkpoints cannot be written to {root}: {reason(error)}; choose a directory that "
             "can be written."
         ) from error
-    return root.resolve()
 
 
-def _is_ours(entry: str) -> bool:
-    return entry.startswith(SCRATCH) or NAME.fullmatch(entry) is not None
+def remove_unfinished(root: Path) -> None:
+    """What killed saves left behind."""
+    for entry in os.listdir(root):
+        if entry.startswith(SCRATCH) and NAME.fullmatch(entry.removeprefix(SCRATCH)):
+            remove(root / entry)
+
+
+def next_serial(root: Path) -> int:
+    """Higher than of anything that has a checkpoint's name, whatever it is."""
+    names = filter(None, map(NAME.fullmatch, os.listdir(root)))
+    return 1 + max((int(name[1]) for name in names), default=0)
 
 
 def discard(path: Path) -> None:
@@ -50,7 +64,7 @@ def discard(path: Path) -> None:
         os.rename(path, doomed)
     except OSError as error:
         warnings.warn(f"old checkpoint {path} stays: {reason(error)}.", stacklevel=4)
-    shutil.rmtree(doomed, ignore_errors=True)
+    remove(doomed)
 
 
 def checkpoints(root: Path) -> list[Path]:
@@ -60,17 +74,16 @@ def checkpoints(root: Path) -> list[Path]:
             found = [
                 root / entry.name
                 for entry in entries
-                if NAME.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False)
+                if NAME.fullmatch(entry.name) and entry.is_dir()
             ]
-    except OSError:
+    except (OSError, ValueError):  # a path with a zero character is a ValueError
         return []
     return sorted(found, key=serial, reverse=True)
 
 
 def candidates(directory: Path) -> list[Path]:
     """Newest first: the checkpoints in `directory`, or itself if it is one."""
-    is_one = os.path.isfile(directory / DESCRIPTION)
-    return [directory] if is_one else checkpoints(directory)
+    return checkpoints(directory) or [directory] * os.path.isfile(directory / DESCRIPTION)
 
 
 def serial(path: Path) -> int:

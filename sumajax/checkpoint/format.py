@@ -68,6 +68,7 @@ class Description(NamedTuple):
     leaves: dict[str, Leaf]
     digests: dict[str, str]  # SHA-256 by leaf
     files: dict[str, tuple[int, str]]  # bytes, SHA-256 by path below the checkpoint
+    checksum: str  # of all this
 
 
 def checksum(content: dict[str, Any]) -> str:
@@ -105,7 +106,7 @@ def read_description(path: Path) -> Description:
 
 
 def _read_bounded(file: Path) -> bytes:
-    status = os.lstat(file)
+    status = os.stat(file)
     if not stat.S_ISREG(status.st_mode):
         raise ValueError("it is not a regular file")
     if status.st_size > MAX_DESCRIPTION_BYTES:
@@ -133,10 +134,12 @@ def checked(content: dict[str, Any]) -> Description:
     digests = {name: str(leaf["sha256"]) for name, leaf in content["leaves"].items()}
     files = {k: (v["bytes"], str(v["sha256"])) for k, v in content["files"].items()}
     for name, (size, _) in files.items():
+        if not set(name.split("/")).isdisjoint({"", ".", ".."}):
+            raise ValueError(f"file {name!r} is not below the checkpoint")
         # Orbax keeps values in folders called d; the rest it reads whole, as JSON and the like.
         limit = MAX_STATE_BYTES if "/d/" in name else MAX_DESCRIPTION_BYTES
         if type(size) is not int or not 0 <= size <= limit:
             raise ValueError(f"file {name} has {size} bytes")
     if sum(size for size, _ in files.values()) > MAX_STATE_BYTES:
         raise ValueError(f"its files have more than {MAX_STATE_BYTES} bytes")
-    return Description(content["meta"], leaves, digests, files)
+    return Description(content["meta"], leaves, digests, files, checksum(content))

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from sumajax.checkpoint.directory import candidates, newest_good
-from sumajax.checkpoint.files import file_digest, verify_files
+from sumajax.checkpoint.files import verify_files
 from sumajax.checkpoint.format import (
     ARRAYS,
-    DESCRIPTION,
     KEYS,
     DamagedError,
+    Description,
     Leaf,
     read_description,
 )
@@ -70,23 +70,28 @@ def read_meta(
 ) -> dict[str, Any]:
     """What the newest good checkpoint is, without its arrays (their files are checked)."""
 
-    def read(path: Path) -> dict[str, Any]:
-        description = read_description(path)
-        verify_files(path, description)
-        return description.meta
-
-    return newest_good(Path(directory), read, say)
+    return newest_good(Path(directory), _verified, say).meta
 
 
-def identity(directory: str | os.PathLike[str]) -> str:
-    """What the newest good checkpoint is known by, wherever it lies: a digest of its content."""
-    return newest_good(Path(directory), lambda path: file_digest(path / DESCRIPTION), None)
+def identity(directory: str | os.PathLike[str], *, say: Callable[[str], None] | None = None) -> str:
+    """What the newest good checkpoint is, wherever it lies: the SHA-256 of its description.
+
+    The description holds the digest of every leaf and every file, so two checkpoints of one
+    identity are copies of each other. Costs what `read_meta` costs.
+    """
+    return newest_good(Path(directory), _verified, say).checksum
 
 
 def latest(directory: str | os.PathLike[str]) -> Path | None:
     """Where the newest checkpoint lies, good or not; None when there is none to go on from."""
     root = Path(directory)
     return next(iter(candidates(root)), None)
+
+
+def _verified(path: Path) -> Description:
+    description = read_description(path)
+    verify_files(path, description)
+    return description
 
 
 def restore(path: Path, like: Any, prefix: str) -> tuple[Any, dict[str, Any]]:
@@ -101,7 +106,7 @@ def restore(path: Path, like: Any, prefix: str) -> tuple[Any, dict[str, Any]]:
     if like is not None:
         compare(path, leaves, {prefix + k: leaf_kind(k, leaf) for k, leaf in wanted.items()})
     verify_files(path, description)
-    found = _read_arrays(path, leaves, description.digests)
+    found = _read_arrays(path, leaves, description)
     if like is None:
         return nested({name.removeprefix(prefix): leaf for name, leaf in found.items()}), (
             description.meta
@@ -110,12 +115,13 @@ def restore(path: Path, like: Any, prefix: str) -> tuple[Any, dict[str, Any]]:
     return jax.tree.unflatten(jax.tree.structure(like), ordered), description.meta
 
 
-def _read_arrays(path: Path, leaves: dict[str, Leaf], digests: dict[str, str]) -> dict[str, Any]:
+def _read_arrays(path: Path, leaves: dict[str, Leaf], description: Description) -> dict[str, Any]:
     """Values by name, each the very bytes that were saved."""
+    files = [k.removeprefix(f"{ARRAYS}/") for k in description.files if k.startswith(f"{ARRAYS}/")]
     stored = {name: leaf.stored for name, leaf in leaves.items() if leaf.nbytes}
     try:
-        arrays = load_arrays(path / ARRAYS, stored)
-    except DamagedError:
+        arrays = load_arrays(path / ARRAYS, files, stored)
+    except CheckpointError:
         raise
     # Whatever Orbax and TensorStore make of files that they cannot read.
     except Exception as error:
@@ -124,7 +130,9 @@ def _read_arrays(path: Path, leaves: dict[str, Leaf], digests: dict[str, str]) -
     for name, leaf in leaves.items():
         shape, dtype = leaf.stored
         array = np.asarray(arrays[name]) if name in stored else np.zeros(shape, dtype)
-        if (array.shape, array.dtype) != (shape, dtype) or array_digest(array) != digests[name]:
+        if (array.shape, array.dtype) != (shape, dtype) or array_digest(array) != (
+            description.digests[name]
+        ):
             raise DamagedError(f"{path} is damaged (leaf {name} is not what was saved)")
         keys = KEYS.get(leaf.dtype)
         found[name] = jax.random.wrap_key_data(jnp.asarray(array), impl=keys[0]) if keys else array

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from sumajax.plain import plain
+
 UP, RIGHT, DOWN, LEFT, STAY, CAPTURE = range(6)
 
 OUTSIDE = -1
@@ -28,17 +30,19 @@ def grid_size(size: int | tuple[int, int], name: str = "size") -> tuple[int, int
     Raises:
       ValueError: for anything but one or two positive whole numbers.
     """
-    sides = tuple(size) if isinstance(size, (tuple, list)) else (size, size)
-    whole = all(isinstance(s, (int, np.integer)) and not isinstance(s, bool) for s in sides)
+    given = plain(size)
+    given = given.tolist() if isinstance(given, np.ndarray) else given
+    sides = tuple(given) if isinstance(given, (tuple, list)) else (given, given)
+    whole = all(isinstance(side, int) and not isinstance(side, bool) for side in sides)
     if not whole or len(sides) != 2 or min(sides) < 1:
         raise ValueError(f"{name} must be a positive int or (rows, columns), got {size!r}.")
-    return int(sides[0]), int(sides[1])
+    return sides[0], sides[1]
 
 
 def plain_size(size: int | tuple[int, int]) -> int | tuple[int, int]:
     """A checked size that compares, hashes and prints alike, whichever kind of numbers it had."""
     rows, columns = grid_size(size)
-    return (rows, columns) if isinstance(size, (tuple, list)) else rows
+    return rows if isinstance(plain(size), int) else (rows, columns)
 
 
 def place_distinct(key: chex.PRNGKey, count: int, size: tuple[int, int]) -> chex.Array:

@@ -21,6 +21,7 @@ from jax.typing import ArrayLike
 
 from sumajax.environments import grid
 from sumajax.environments.types import Observation, Transition
+from sumajax.plain import plain_fields
 
 STEP_REWARD = -0.05
 """Per agent and step while its work is not done (the originals' TIMESTEP_PENALTY)."""
@@ -80,6 +81,7 @@ class PredatorCapturePrey:
     num_actions: ClassVar[int] = 6
 
     def __post_init__(self) -> None:
+        plain_fields(self)
         object.__setattr__(self, "size", grid.plain_size(self.size))
         _validate(self)
 
@@ -314,7 +316,7 @@ def _validate(env: PredatorCapturePrey) -> None:
         value = getattr(env, name)
         if name == "capture_vision" and value is None:
             continue
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        if isinstance(value, bool) or not isinstance(value, int):
             raise ValueError(f"{name} must be a whole number, got {value!r}.")
     least_values = {"num_predators": 0, "num_capturers": 0, "vision": 0, "max_steps": 1}
     for name, least in least_values.items():

@@ -2,18 +2,17 @@
 
 import json
 import os
-import platform
 import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
 from sumajax import reporting
+from sumajax.description import versions
 
 
 @contextmanager
@@ -127,8 +126,3 @@ def _stages(value: Any) -> bool:
 def plain(value: Any) -> Any:
     """`value` as JSON would read it back."""
     return json.loads(json.dumps(value, default=str))
-
-
-def versions() -> dict[str, str]:
-    packages = ("sumajax", "jax", "flax", "optax", "orbax-checkpoint", "numpy")
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}

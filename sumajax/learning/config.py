@@ -6,6 +6,8 @@ from math import inf
 from numbers import Real
 from typing import Any, Literal, get_args
 
+from sumajax.plain import plain_fields
+
 EPOCH_STEPS = 20_000
 """Environment steps of an epoch: 10 updates of 4 processes x 500 steps, as the paper's runs."""
 
@@ -76,6 +78,7 @@ class LearnerConfig:
     detach_gap: int | None = None
 
     def __post_init__(self) -> None:
+        plain_fields(self)
         _validate(self)
 
     def for_stage(self, epochs: int, *, transferred: bool = False) -> "LearnerConfig":

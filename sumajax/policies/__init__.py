@@ -6,6 +6,7 @@ A policy of your own needs no entry here: `Policy("mine", MyModule(TeamSpec.of(e
 from typing import Any, Literal, get_args, get_origin
 
 from sumajax.environments.types import Environment
+from sumajax.plain import plain
 from sumajax.policies import hetnet, ic3net, magic
 from sumajax.policies.types import Decision, Policy, PolicyModule, PolicyOutput, TeamSpec
 
@@ -45,6 +46,7 @@ def make_policy(name: str, env: Environment, **settings: Any) -> Policy:
         raise ValueError(
             f"policy {name!r} has no setting {unknown[0]!r}; it has {', '.join(sorted(known))}."
         )
+    settings = plain(settings)
     for setting, value in settings.items():
         if isinstance(value, int) and value < 1 and not isinstance(value, bool):
             raise ValueError(f"policy setting {setting} must be at least 1, got {value}.")
