@@ -73,7 +73,7 @@ def evaluate_random(
     env: Environment, policy: Policy, key: chex.PRNGKey, *, episodes: int = EPISODES
 ) -> Evaluation:
     """The held-out starts under uniformly random actions, each class over the actions it has."""
-    logits = jnp.where(jnp.asarray(env.action_mask), 0.0, -jnp.inf)
+    logits = jnp.where(jnp.asarray(env.action_mask), jnp.float32(0.0), -jnp.inf)
 
     def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
         shape = actors.episode_return.shape
@@ -126,21 +126,22 @@ def _play(
         # A row past the end is dropped.
         row = jnp.where(done, queue.episode, episodes)
         result = jax.tree.map(lambda x, y: x.at[row].set(y, mode="drop"), queue.result, now)
-        episode = jnp.where(done, queue.following + jnp.cumsum(done) - 1, queue.episode)
+        ended = jnp.cumsum(done, dtype=jnp.int32)
+        episode = jnp.where(done, queue.following + ended - 1, queue.episode)
         fresh = jax.tree.map(lambda x: x[jnp.minimum(episode, episodes - 1)], starts)
         actors = Actors(
             env_state=select(done, fresh, env_state),
             carry=select(done, policy.initial_carry((lanes,)), carry),
             episode_return=jnp.where(done[:, None], 0.0, episode_return),
         )
-        return _Queue(actors, episode, queue.following + done.sum(), result, queue.time + 1)
+        return _Queue(actors, episode, queue.following + ended[-1], result, queue.time + 1)
 
     result = Evaluation(
         steps_taken=jnp.zeros(episodes, jnp.int32),
         success=jnp.zeros(episodes, bool),
-        episode_return=jnp.zeros(episodes),
+        episode_return=jnp.zeros(episodes, jnp.float32),
     )
-    queue = _Queue(first, jnp.arange(lanes), jnp.int32(lanes), result, jnp.int32(0))
+    queue = _Queue(first, jnp.arange(lanes, dtype=jnp.int32), jnp.int32(lanes), result, jnp.int32(0))
     return jax.lax.while_loop(unfinished, body, queue).result
 
 

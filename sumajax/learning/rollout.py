@@ -60,7 +60,7 @@ def start(env: Environment, policy: Policy, keys: chex.PRNGKey) -> Actors:
     return Actors(
         env_state=jax.vmap(env.reset)(keys),
         carry=policy.initial_carry((num_envs,)),
-        episode_return=jnp.zeros((num_envs, env.num_agents)),
+        episode_return=jnp.zeros((num_envs, env.num_agents), jnp.float32),
     )
 
 

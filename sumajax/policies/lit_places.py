@@ -34,7 +34,7 @@ def lit_places(states: np.ndarray, first: Patches, second: Patches) -> LitPlaces
     with jax.ensure_compile_time_eval():
         once = np.asarray(first(states))
         seen = np.asarray(second(once))
-        exists = np.asarray(second(jnp.ones((1, *once.shape[1:3], 1))))
+        exists = np.asarray(second(jnp.ones((1, *once.shape[1:3], 1), once.dtype)))
     num_states, inputs = len(states), once.shape[-1]
     seen = np.moveaxis(seen.reshape(num_states, -1, seen.shape[-1] // inputs, inputs), 0, 1)
     lit = (seen != 0).any((-1, -2))  # (P, S)

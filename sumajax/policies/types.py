@@ -17,6 +17,7 @@ from flax import linen as nn
 from flax import struct
 
 from sumajax.environments.types import Environment, Observation
+from sumajax.policies.layers import lift
 
 FOLDED = "folded"
 """Name of the variables that `Policy.prepare` adds to the parameters."""
@@ -154,8 +155,8 @@ class Policy:
         """Fresh parameters."""
         team = self.team
         obs = Observation(
-            state=jnp.zeros((team.num_agents, *team.state_shape)),
-            view=jnp.zeros((team.num_agents, *team.view_shape)),
+            state=jnp.zeros((team.num_agents, *team.state_shape), jnp.float32),
+            view=jnp.zeros((team.num_agents, *team.view_shape), jnp.float32),
         )
         draws = jax.eval_shape(lambda: self.sample_noise(key, ()))  # the key is for `init` alone
         noise = jax.tree.map(lambda draw: jnp.zeros(draw.shape, draw.dtype), draws)
@@ -212,4 +213,4 @@ def decide(logits: chex.Array, gumbel: chex.Array) -> Decision:
 def mask_actions(logits: chex.Array, team: TeamSpec) -> chex.Array:
     """(..., N, num_actions) logits with the actions an agent does not have at `MASKED_LOGIT`."""
     mask = np.array(team.action_mask)
-    return logits if mask.all() else jnp.where(mask, logits, MASKED_LOGIT)
+    return logits if mask.all() else jnp.where(lift(mask, logits.ndim), logits, MASKED_LOGIT)
