@@ -1,7 +1,6 @@
 """Held-out episodes, sampled and greedy; a random policy and the shortest paths beside them."""
 
 import os
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,13 +8,15 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from sumajax import checkpoint
 from sumajax.checkpoint import CheckpointError
 from sumajax.description import rebuild_policy, rebuild_task
 from sumajax.environments.types import Environment, Observation
-from sumajax.learning.rollout import Actors, act, select, start, state_features
+from sumajax.keys import key_of
+from sumajax.learning.rollout import Actors, act, select, state_features
 from sumajax.policies.types import Policy
 from sumajax.transfer import checkpoints_of
 
@@ -26,6 +27,7 @@ LANES = 128
 """Held-out episodes in progress at a time."""
 
 
+@exportable
 @struct.dataclass
 class Evaluation:
     """One row per episode."""
@@ -37,7 +39,7 @@ class Evaluation:
 
 def held_out_keys(episodes: int = EPISODES) -> chex.PRNGKey:
     """(episodes,) reset keys of the fixed held-out starts; the same for every policy and seed."""
-    return jax.random.split(jax.random.key(HELD_OUT_SEED), episodes)
+    return jax.random.split(key_of(HELD_OUT_SEED), episodes)
 
 
 @partial(jax.jit, static_argnames=("env", "policy", "episodes"))
@@ -110,8 +112,12 @@ def _play(
     hold up everybody, so a lane whose episode ends takes the next start that is left.
     """
     keys = held_out_keys(episodes)
-    first = start(env, policy, keys[:LANES])
-    starts, lanes = jax.vmap(env.reset)(keys), first.episode_return.shape[0]
+    starts, lanes = jax.vmap(env.reset)(keys), min(LANES, episodes)
+    first = Actors(
+        env_state=jax.tree.map(lambda x: x[:lanes], starts),
+        carry=policy.initial_carry((lanes,)),
+        episode_return=jnp.zeros((lanes, env.num_agents), jnp.float32),
+    )
 
     def unfinished(queue: _Queue) -> chex.Array:
         return (queue.episode < episodes).any()
@@ -141,32 +147,48 @@ def _play(
         success=jnp.zeros(episodes, bool),
         episode_return=jnp.zeros(episodes, jnp.float32),
     )
-    queue = _Queue(first, jnp.arange(lanes, dtype=jnp.int32), jnp.int32(lanes), result, jnp.int32(0))
+    episode = jnp.arange(lanes, dtype=jnp.int32)
+    queue = _Queue(first, episode, jnp.int32(lanes), result, jnp.int32(0))
     return jax.lax.while_loop(unfinished, body, queue).result
 
 
-@dataclass(frozen=True)
+@struct.dataclass
 class Agent:
-    """A trained policy to act with: pure, batched over any leading axes, traceable."""
+    """A trained policy to act with: pure, batched over any leading axes, traceable.
 
-    env: Environment
-    policy: Policy
+    A pytree whose leaves are the parameters: it can be an argument of a compiled function.
+    """
+
+    env: Environment = struct.field(pytree_node=False)
+    policy: Policy = struct.field(pytree_node=False)
     params: Any
+
+    def __eq__(self, other: object) -> bool:
+        """The same policy for the same task, with the same numbers."""
+        if not isinstance(other, Agent) or (self.env, self.policy) != (other.env, other.policy):
+            return False
+        mine, theirs = jax.tree.flatten(self.params), jax.tree.flatten(other.params)
+        return mine[1] == theirs[1] and all(map(np.array_equal, mine[0], theirs[0]))
+
+    def __hash__(self) -> int:
+        return hash((self.env, self.policy))
 
     def initial_carry(self, batch_shape: tuple[int, ...] = ()) -> Any:
         """What the team remembers at the start of an episode."""
         return self.policy.initial_carry(batch_shape)
 
     def act(
-        self, carry: Any, obs: Observation, key: chex.PRNGKey, *, greedy: bool = False
+        self, carry: Any, obs: Observation, key: chex.PRNGKey, *, greedy: chex.Numeric = False
     ) -> tuple[Any, chex.Array]:
-        """(next carry, actions (..., N) int32) for obs.state (..., N, 1, rows, columns)."""
-        if greedy:
-            noise = self.policy.sample_noise(key, obs.view.shape[:-4])
-            noise = jax.tree.map(jnp.zeros_like, noise)
-            carry, output = self.policy.apply_with(self.params, carry, obs, noise)
-        else:
-            carry, output = self.policy.apply(self.params, carry, obs, key)
+        """(next carry, actions (..., N) int32) for obs.state (..., N, 1, rows, columns).
+
+        Args:
+          key: ignored when greedy.
+          greedy: take the likeliest choice everywhere; may be traced.
+        """
+        noise = self.policy.sample_noise(key, obs.view.shape[:-4])
+        noise = jax.tree.map(lambda x: jnp.where(greedy, 0.0, x), noise)
+        carry, output = self.policy.apply_with(self.params, carry, obs, noise)
         return carry, output.action
 
 
@@ -196,7 +218,7 @@ def load_agent(
     else:
         env, policy = _given(meta, env, policy)
         checkpoint.check_compatible(meta, env, policy, root)
-    like = jax.eval_shape(policy.init, jax.random.key(0))
+    like = jax.eval_shape(policy.init, key_of(0))
     seeds = meta.get("seeds", [])
     if seed is not None and seed not in (seeds or [0]):
         raise CheckpointError(f"{root} holds seeds {seeds or [0]}, not {seed}.")

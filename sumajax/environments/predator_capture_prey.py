@@ -21,6 +21,7 @@ from jax.typing import ArrayLike
 
 from sumajax.environments import grid
 from sumajax.environments.types import Observation, Transition
+from sumajax.records import exportable
 
 STEP_REWARD = -0.05
 """Per agent and step while its work is not done (the originals' TIMESTEP_PENALTY)."""
@@ -38,6 +39,7 @@ RewardMode = Literal["mixed", "cooperative", "competitive"]
 CaptureReward = Literal["default", "second"]
 
 
+@exportable
 @struct.dataclass
 class State:
     """One episode in progress. N agents: predators first, then capture agents."""

@@ -12,8 +12,10 @@ from flax import struct
 from sumajax.environments.types import Environment
 from sumajax.learning.windows import windows
 from sumajax.policies.types import Decision, Policy
+from sumajax.records import exportable
 
 
+@exportable
 @struct.dataclass
 class Actors:
     """E environments with the teams that live in them."""

@@ -163,7 +163,9 @@ class ObservationEncoder(nn.Module):
     def see(self, view: chex.Array, sighted: np.ndarray) -> chex.Array:
         """(..., N, 32): the views, encoded; 0 for who does not see."""
         seen = self.view_encoder(view)
-        return seen if sighted.all() else seen * lift(sighted[:, None], seen.ndim).astype(seen.dtype)
+        if sighted.all():
+            return seen
+        return seen * lift(sighted[:, None], seen.ndim).astype(seen.dtype)
 
     def view_kernel(self) -> chex.Array:
         """(32, features): turns what is seen into its share of the merged features."""

@@ -39,6 +39,7 @@ from sumajax.policies.types import (
     decide,
     mask_actions,
 )
+from sumajax.records import exportable
 
 Meta = Literal["normalised", "repo"]
 
@@ -62,6 +63,7 @@ META_SCALE = (10.0, 10.0, 20.0, META_CONSTANT)
 """Divisors of the default descriptor; the raw one starts the critic 100 times too high."""
 
 
+@exportable
 @struct.dataclass
 class HetNetCarry:
     """What the agents remember, predators first."""

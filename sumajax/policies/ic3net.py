@@ -15,10 +15,12 @@ from flax import struct
 from sumajax.policies.encoder import EncoderKind, ObservationEncoder
 from sumajax.policies.layers import Dense, LSTMCell, lift, side_by_side
 from sumajax.policies.types import Decision, PolicyModule, PolicyOutput, decide, mask_actions
+from sumajax.records import exportable
 
 SILENT, TALK = 0, 1
 
 
+@exportable
 @struct.dataclass
 class IC3NetCarry:
     """What the agents remember."""

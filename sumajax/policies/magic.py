@@ -26,6 +26,7 @@ from sumajax.policies.layers import (
     uniform_fan_in,
 )
 from sumajax.policies.types import PolicyModule, PolicyOutput, decide, mask_actions
+from sumajax.records import exportable
 
 Setting = Literal["medium", "hard"]
 
@@ -36,6 +37,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 """What differs between the published arguments for 10x10 with 5 agents and 20x20 with 10."""
 
 
+@exportable
 @struct.dataclass
 class MAGICCarry:
     """What the agents remember."""

@@ -18,6 +18,7 @@ from flax import struct
 
 from sumajax.environments.types import Environment, Observation
 from sumajax.policies.layers import lift
+from sumajax.records import exportable
 
 FOLDED = "folded"
 """Name of the variables that `Policy.prepare` adds to the parameters."""
@@ -25,6 +26,7 @@ MASKED_LOGIT = -1e9
 """Logit of an action that an agent's class does not have: probability exactly 0 in float32."""
 
 
+@exportable
 @struct.dataclass
 class Decision:
     """One sampled choice per agent, kept with what it was sampled from."""
@@ -33,6 +35,7 @@ class Decision:
     choice: chex.Array  # (..., N) int32 in 0..K-1
 
 
+@exportable
 @struct.dataclass
 class PolicyOutput:
     """What a team decided in one step."""
@@ -172,14 +175,14 @@ class Policy:
         self, params: Any, carry: Any, obs: Observation, key: chex.PRNGKey
     ) -> tuple[Any, PolicyOutput]:
         """One team step: obs.state (..., N, 1, rows, columns), obs.view (..., N, c, m, m)."""
-        chex.assert_shape(obs.state, (..., *self.team.state_shape))
-        chex.assert_shape(obs.view, (..., *self.team.view_shape))
         return self.apply_with(params, carry, obs, self.sample_noise(key, obs.view.shape[:-4]))
 
     def apply_with(
         self, params: Any, carry: Any, obs: Observation, noise: Any
     ) -> tuple[Any, PolicyOutput]:
         """`apply` with given random numbers; all zeros make every choice the likeliest."""
+        chex.assert_shape(obs.state, (..., *self.team.state_shape))
+        chex.assert_shape(obs.view, (..., *self.team.view_shape))
         step = self.module.apply(params, carry, obs, noise, method=self.module.encode_and_step)
         return cast(tuple[Any, PolicyOutput], step)
 
