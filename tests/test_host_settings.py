@@ -114,7 +114,9 @@ def test_the_same_results(settings, tmp_path, tmp_path_factory):
         found = jax.device_get(results(tmp_path / "saved"))
     assert_narrow(found)
     assert np.isnan(expected["metrics"]["steps_taken"]).tolist() == [True, True, False]
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, expected)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, expected
+    )
 
 
 @pytest.mark.parametrize("settings", OTHER, ids=name_of)
