@@ -167,8 +167,9 @@ class Agent:
         """The same policy for the same task, with the same numbers."""
         if not isinstance(other, Agent) or (self.env, self.policy) != (other.env, other.policy):
             return False
-        mine, theirs = jax.tree.flatten(self.params), jax.tree.flatten(other.params)
-        return mine[1] == theirs[1] and all(map(np.array_equal, mine[0], theirs[0]))
+        flatten: Any = jax.tree.flatten
+        (mine, structure), (theirs, of_theirs) = flatten(self.params), flatten(other.params)
+        return structure == of_theirs and all(map(np.array_equal, mine, theirs))
 
     def __hash__(self) -> int:
         return hash((self.env, self.policy))

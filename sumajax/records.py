@@ -1,7 +1,7 @@
 """Records that cross the border of a compiled program, and can be written with it."""
 
 import contextlib
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax.export
 
@@ -25,6 +25,6 @@ def exportable(cls: Record) -> Record:
             serialized_name=f"{cls.__module__}.{cls.__qualname__}",
             serialize_auxdata=lambda _: b"",
             deserialize_auxdata=lambda _: (),
-            from_children=made,
+            from_children=cast(Any, made),
         )
     return cls

@@ -70,12 +70,12 @@ def normalise_by_class(
       padded: (E, 1) steps with the padding, episodes x `max_steps`.
       peers: (N, N) 1 where two agents are of one class.
     """
-    peers = jnp.asarray(peers, x.dtype)
-    size, weight = peers.sum(0)[None], valid[..., None].astype(x.dtype)  # (1, N), (T, E, 1)
+    same = jnp.asarray(peers, x.dtype)
+    size, weight = same.sum(0)[None], valid[..., None].astype(x.dtype)  # (1, N), (T, E, 1)
     entries, steps = padded.astype(x.dtype) * size, weight.sum(0) * size  # (E, N)
-    mean = (weight * x).sum(0) @ peers / entries
+    mean = (weight * x).sum(0) @ same / entries
     centred = x - mean[None]
-    squares = (weight * centred**2).sum(0) @ peers + (entries - steps) * mean**2
+    squares = (weight * centred**2).sum(0) @ same + (entries - steps) * mean**2
     return centred / (jnp.sqrt(squares / (entries - 1)) + STD_EPS)[None]
 
 

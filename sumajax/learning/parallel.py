@@ -104,7 +104,7 @@ def available_devices() -> list[jax.Device]:
         return jax.local_devices()
     except RuntimeError as error:
         raise ValueError(
-            f"JAX finds no device of the kind that JAX_PLATFORMS={jax.config.jax_platforms!r} asks "
+            f"JAX finds no device of the kind that JAX_PLATFORMS={_platforms()!r} asks "
             f"for ({str(error).splitlines()[0]}); unset JAX_PLATFORMS, or install what drives it."
         ) from None
 
@@ -133,8 +133,12 @@ def choose_devices(
 
 def _cpu_may_compute() -> bool:
     """Unless JAX was told to use something else. With an accelerator CPU devices lie idle."""
-    platforms = jax.config.jax_platforms or ""
-    return platforms.split(",")[0] in ("", "cpu")
+    return _platforms().split(",")[0] in ("", "cpu")
+
+
+def _platforms() -> str:
+    """What JAX was told to use, by the environment or by the program."""
+    return jax.config.read("jax_platforms") or ""
 
 
 def spread(num_seeds: int, num_envs: int, devices: int) -> tuple[int, int]:
