@@ -37,7 +37,6 @@ SAME = [
     {"jax_debug_infs": True},
     {"jax_debug_key_reuse": True},
     {"jax_check_tracer_leaks": True, "jax_enable_checks": True},
-    {"jax_disable_jit": True},
     {"jax_default_matmul_precision": "highest"},
 ]
 """What changes no number, but in the last digits."""
@@ -116,6 +115,21 @@ def test_the_same_results(settings, tmp_path, tmp_path_factory):
     assert np.isnan(expected["metrics"]["steps_taken"]).tolist() == [True, True, False]
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, expected
+    )
+
+
+def test_without_compiling():
+    """Every operation by itself: a few of them, since each waits for its own."""
+    env = PredatorPrey(size=2, num_predators=2, max_steps=2)
+    policy = make_policy("iric", env, hidden=2, encoder="linear")
+    learner = make_learner(env, policy, preset("fast", num_envs=2, rollout_length=2))
+    state = learner.init(key_of(0))
+    expected = jax.jit(learner.update)(state)[0].params
+    with set_to({"jax_disable_jit": True}):
+        found = learner.update(state)[0].params
+        assert int(evaluate(env, policy, found, key_of(1), episodes=2).steps_taken.max()) <= 2
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), found, expected
     )
 
 
