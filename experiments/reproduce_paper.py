@@ -40,10 +40,10 @@ from paper_results import (
     machine,
     recognised,
 )
-
-from sumajax import checkpoint
 from sumajax.cli.command_line import parse, plain_errors, prepare_jax
 from sumajax.cli.transfer_config import MAX_DEVICES, MAX_EPOCHS, SOURCE, check_seeds
+
+from sumajax import checkpoint
 from sumajax.description import versions
 from sumajax.experiment.run import run_experiment
 from sumajax.reporting import write_json

@@ -1,7 +1,6 @@
 """Held-out episodes, sampled and greedy; a random policy and the shortest paths beside them."""
 
 import os
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,14 +8,17 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from sumajax import checkpoint
 from sumajax.checkpoint import CheckpointError
 from sumajax.description import rebuild_policy, rebuild_task
 from sumajax.environments.types import Environment, Observation
-from sumajax.learning.rollout import Actors, act, select, start, state_features
+from sumajax.keys import key_of
+from sumajax.learning.rollout import Actors, act, select, state_features
 from sumajax.policies.types import Policy
+from sumajax.records import exportable
 from sumajax.transfer import checkpoints_of
 
 HELD_OUT_SEED = 20_240_229
@@ -26,6 +28,7 @@ LANES = 128
 """Held-out episodes in progress at a time."""
 
 
+@exportable
 @struct.dataclass
 class Evaluation:
     """One row per episode."""
@@ -37,7 +40,7 @@ class Evaluation:
 
 def held_out_keys(episodes: int = EPISODES) -> chex.PRNGKey:
     """(episodes,) reset keys of the fixed held-out starts; the same for every policy and seed."""
-    return jax.random.split(jax.random.key(HELD_OUT_SEED), episodes)
+    return jax.random.split(key_of(HELD_OUT_SEED), episodes)
 
 
 @partial(jax.jit, static_argnames=("env", "policy", "episodes"))
@@ -73,7 +76,7 @@ def evaluate_random(
     env: Environment, policy: Policy, key: chex.PRNGKey, *, episodes: int = EPISODES
 ) -> Evaluation:
     """The held-out starts under uniformly random actions, each class over the actions it has."""
-    logits = jnp.where(jnp.asarray(env.action_mask), 0.0, -jnp.inf)
+    logits = jnp.where(jnp.asarray(env.action_mask), jnp.float32(0.0), -jnp.inf)
 
     def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
         shape = actors.episode_return.shape
@@ -110,8 +113,12 @@ def _play(
     hold up everybody, so a lane whose episode ends takes the next start that is left.
     """
     keys = held_out_keys(episodes)
-    first = start(env, policy, keys[:LANES])
-    starts, lanes = jax.vmap(env.reset)(keys), first.episode_return.shape[0]
+    starts, lanes = jax.vmap(env.reset)(keys), min(LANES, episodes)
+    first = Actors(
+        env_state=jax.tree.map(lambda x: x[:lanes], starts),
+        carry=policy.initial_carry((lanes,)),
+        episode_return=jnp.zeros((lanes, env.num_agents), jnp.float32),
+    )
 
     def unfinished(queue: _Queue) -> chex.Array:
         return (queue.episode < episodes).any()
@@ -126,46 +133,64 @@ def _play(
         # A row past the end is dropped.
         row = jnp.where(done, queue.episode, episodes)
         result = jax.tree.map(lambda x, y: x.at[row].set(y, mode="drop"), queue.result, now)
-        episode = jnp.where(done, queue.following + jnp.cumsum(done) - 1, queue.episode)
+        ended = jnp.cumsum(done, dtype=jnp.int32)
+        episode = jnp.where(done, queue.following + ended - 1, queue.episode)
         fresh = jax.tree.map(lambda x: x[jnp.minimum(episode, episodes - 1)], starts)
         actors = Actors(
             env_state=select(done, fresh, env_state),
             carry=select(done, policy.initial_carry((lanes,)), carry),
             episode_return=jnp.where(done[:, None], 0.0, episode_return),
         )
-        return _Queue(actors, episode, queue.following + done.sum(), result, queue.time + 1)
+        return _Queue(actors, episode, queue.following + ended[-1], result, queue.time + 1)
 
     result = Evaluation(
         steps_taken=jnp.zeros(episodes, jnp.int32),
         success=jnp.zeros(episodes, bool),
-        episode_return=jnp.zeros(episodes),
+        episode_return=jnp.zeros(episodes, jnp.float32),
     )
-    queue = _Queue(first, jnp.arange(lanes), jnp.int32(lanes), result, jnp.int32(0))
+    episode = jnp.arange(lanes, dtype=jnp.int32)
+    queue = _Queue(first, episode, jnp.int32(lanes), result, jnp.int32(0))
     return jax.lax.while_loop(unfinished, body, queue).result
 
 
-@dataclass(frozen=True)
+@struct.dataclass
 class Agent:
-    """A trained policy to act with: pure, batched over any leading axes, traceable."""
+    """A trained policy to act with: pure, batched over any leading axes, traceable.
 
-    env: Environment
-    policy: Policy
+    A pytree whose leaves are the parameters: it can be an argument of a compiled function.
+    """
+
+    env: Environment = struct.field(pytree_node=False)
+    policy: Policy = struct.field(pytree_node=False)
     params: Any
+
+    def __eq__(self, other: object) -> bool:
+        """The same policy for the same task, with the same numbers."""
+        if not isinstance(other, Agent) or (self.env, self.policy) != (other.env, other.policy):
+            return False
+        flatten: Any = jax.tree.flatten
+        (mine, structure), (theirs, of_theirs) = flatten(self.params), flatten(other.params)
+        return structure == of_theirs and all(map(np.array_equal, mine, theirs))
+
+    def __hash__(self) -> int:
+        return hash((self.env, self.policy))
 
     def initial_carry(self, batch_shape: tuple[int, ...] = ()) -> Any:
         """What the team remembers at the start of an episode."""
         return self.policy.initial_carry(batch_shape)
 
     def act(
-        self, carry: Any, obs: Observation, key: chex.PRNGKey, *, greedy: bool = False
+        self, carry: Any, obs: Observation, key: chex.PRNGKey, *, greedy: chex.Numeric = False
     ) -> tuple[Any, chex.Array]:
-        """(next carry, actions (..., N) int32) for obs.state (..., N, 1, rows, columns)."""
-        if greedy:
-            noise = self.policy.sample_noise(key, obs.view.shape[:-4])
-            noise = jax.tree.map(jnp.zeros_like, noise)
-            carry, output = self.policy.apply_with(self.params, carry, obs, noise)
-        else:
-            carry, output = self.policy.apply(self.params, carry, obs, key)
+        """(next carry, actions (..., N) int32) for obs.state (..., N, 1, rows, columns).
+
+        Args:
+          key: ignored when greedy.
+          greedy: take the likeliest choice everywhere; may be traced.
+        """
+        noise = self.policy.sample_noise(key, obs.view.shape[:-4])
+        noise = jax.tree.map(lambda x: jnp.where(greedy, 0.0, x), noise)
+        carry, output = self.policy.apply_with(self.params, carry, obs, noise)
         return carry, output.action
 
 
@@ -195,7 +220,7 @@ def load_agent(
     else:
         env, policy = _given(meta, env, policy)
         checkpoint.check_compatible(meta, env, policy, root)
-    like = jax.eval_shape(policy.init, jax.random.key(0))
+    like = jax.eval_shape(policy.init, key_of(0))
     seeds = meta.get("seeds", [])
     if seed is not None and seed not in (seeds or [0]):
         raise CheckpointError(f"{root} holds seeds {seeds or [0]}, not {seed}.")

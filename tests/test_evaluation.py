@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sumajax import evaluation
+from sumajax import checkpoint, evaluation
+from sumajax.checkpoint import CheckpointError
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.evaluation import (
     EPISODES,
@@ -15,6 +16,7 @@ from sumajax.evaluation import (
     evaluate,
     evaluate_random,
     held_out_keys,
+    load_agent,
     shortest_path_steps,
 )
 from sumajax.policies import make_policy
@@ -132,6 +134,17 @@ class TestGreedy:
                 break
         assert int(played(greedy=True).steps_taken[0]) == int(transition.steps_taken)
 
+    def test_greedy_may_be_traced_or_known(self):
+        policy, params = tiny_policy()
+        agent, carry = Agent(TINY, policy, params), policy.initial_carry()
+        obs, key = TINY.observe(TINY.reset(held_out_keys(FEW)[0])), jax.random.key(0)
+        traced = jax.jit(agent.act)
+        known = jax.jit(agent.act, static_argnames="greedy")
+        for greedy in (False, True):
+            expected = agent.act(carry, obs, key, greedy=greedy)[1]
+            for compiled in (traced, known):
+                np.testing.assert_array_equal(compiled(carry, obs, key, greedy=greedy)[1], expected)
+
     def test_both_kinds_share_one_program(self):
         policy, params = tiny_policy()
         played(greedy=False)
@@ -140,6 +153,34 @@ class TestGreedy:
         other = jax.tree.map(lambda p: p + 1, params)
         evaluate(TINY, policy, other, jax.random.key(3), episodes=FEW, greedy=True)
         assert evaluate._cache_size() == before
+
+
+class TestAgent:
+    def test_is_an_argument_like_any_other(self):
+        """Its parameters are leaves, task and policy the structure: one program for all of them."""
+        policy, params = tiny_policy()
+        obs = TINY.observe(TINY.reset(held_out_keys(FEW)[0]))
+
+        @jax.jit
+        def value(agent):
+            return agent.policy.apply(agent.params, agent.initial_carry(), obs, jax.random.key(0))
+
+        agent = Agent(TINY, policy, params)
+        doubled = jax.tree.map(lambda x: 2 * x, agent)
+        assert isinstance(doubled, Agent)
+        assert jax.tree.structure(doubled) == jax.tree.structure(agent)
+        first, second = value(agent)[1].value, value(doubled)[1].value
+        assert value._cache_size() == 1
+        assert not np.allclose(first, second)
+
+    def test_is_compared_by_what_it_does(self):
+        policy, params = tiny_policy()
+        agent, same = (Agent(TINY, policy, jax.tree.map(jnp.array, params)) for _ in range(2))
+        other = agent.replace(params=jax.tree.map(lambda x: x + 1, params))
+        assert agent == same
+        assert hash(agent) == hash(same)
+        assert agent not in (other, agent.replace(env=PP), "agent")
+        assert len({agent, same, other}) == 2
 
 
 class TestBound:
@@ -165,3 +206,26 @@ class TestBound:
 
     def test_a_task_that_offers_none(self):
         assert shortest_path_steps(object()) is None
+
+
+class TestLoadAgent:
+    @pytest.fixture
+    def directory(self, tmp_path):
+        """Seeds 7 and 8."""
+        policy, params = tiny_policy()
+        stacked = jax.tree.map(lambda x: jnp.stack([x, x + 1]), params)
+        meta = checkpoint.describe(TINY, policy, seeds=[7, 8])
+        checkpoint.save(tmp_path / "saved", {"params": stacked}, meta)
+        return tmp_path / "saved"
+
+    def test_a_seed_is_called_by_its_number(self, directory):
+        policy, params = tiny_policy()
+        first, second = (load_agent(directory, seed=seed) for seed in (7, 8))
+        assert first == Agent(TINY, policy, params)
+        assert second == Agent(TINY, policy, jax.tree.map(lambda x: x + 1, params))
+        assert load_agent(directory) == first
+
+    def test_one_that_there_is_not(self, directory):
+        """A place in the list is no seed."""
+        with pytest.raises(CheckpointError, match=r"has no seed 1; its seeds are 7, 8\."):
+            load_agent(directory, seed=1)

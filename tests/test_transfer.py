@@ -12,7 +12,8 @@ from sumajax.checkpoint import CheckpointError
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import LearnerConfig, config, make_learner, parallel
 from sumajax.learning.guard import FAULTS
-from sumajax.learning.learner import Metrics
+from sumajax.learning.learner import Metrics, Tally
+from sumajax.learning.losses import LossParts
 from sumajax.policies import make_policy
 from sumajax.transfer import (
     StageRun,
@@ -162,8 +163,10 @@ def train_until(ends, learner):
             wanted = np.asarray(states.updates) + each * epochs
             updates = np.minimum(wanted, ends)
             fault = np.where(updates < wanted, 1 + FAULTS.index("gradient became NaN"), 0)
-            figures = dict.fromkeys(Metrics.__dataclass_fields__, np.zeros((len(ends), epochs)))
-            metrics = Metrics(**figures | {"fault": np.tile(fault[:, None], epochs)})
+            zeros = np.zeros((len(ends), epochs))
+            loss = LossParts(*[zeros] * len(LossParts.__dataclass_fields__))
+            sums = Tally(**dict.fromkeys(Tally.__dataclass_fields__, zeros) | {"loss": loss})
+            metrics = Metrics(sums, np.tile(fault[:, None], epochs))
             return states.replace(updates=jnp.asarray(updates)), metrics
 
         return train

@@ -22,6 +22,7 @@ from flax import struct
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.environments.types import Environment
+from sumajax.records import exportable
 from sumajax.upsampling import StateUpsampled
 
 if importlib.util.find_spec("jaxmarl") is not None:
@@ -40,6 +41,7 @@ TASKS: dict[str, type[PredatorCapturePrey]] = {
 """Names for `make`."""
 
 
+@exportable
 @struct.dataclass
 class State:
     """An episode in progress, with the two fields that JaxMARL's states have."""

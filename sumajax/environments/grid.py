@@ -83,8 +83,11 @@ def move(position: chex.Array, action: chex.Array, size: tuple[int, int]) -> che
 
     Every action but the four directions, known or not, leaves the cell as it is.
     """
-    row = position[..., 0] + (action == DOWN) - (action == UP)
-    column = position[..., 1] + (action == RIGHT) - (action == LEFT)
+    down, up, right, left = (
+        (action == way).astype(position.dtype) for way in (DOWN, UP, RIGHT, LEFT)
+    )
+    row = position[..., 0] + down - up
+    column = position[..., 1] + right - left
     return jnp.stack([jnp.clip(row, 0, size[0] - 1), jnp.clip(column, 0, size[1] - 1)], axis=-1)
 
 
@@ -113,9 +116,9 @@ def window_offsets(vision: int) -> np.ndarray:
 
 def window_outside(position: chex.Array, vision: int, size: tuple[int, int]) -> chex.Array:
     """(N, m, m) bool: cells of each agent's window that lie outside the grid."""
-    reach = jnp.arange(-vision, vision + 1)
-    row = position[:, 0, None, None] + reach[:, None]
-    column = position[:, 1, None, None] + reach
+    reach = jnp.arange(-vision, vision + 1, dtype=jnp.int32)
+    row = position[:, 0, None, None] + reach[None, :, None]
+    column = position[:, 1, None, None] + reach[None, None, :]
     return (row < 0) | (row >= size[0]) | (column < 0) | (column >= size[1])
 
 
@@ -129,12 +132,14 @@ def window_count(position: chex.Array, entities: chex.Array, vision: int) -> che
 
     Counts are not clipped to one, and an agent that is one of the entities counts itself.
     """
-    reach = jnp.arange(-vision, vision + 1)
-    window = _number(position)[:, None, None] + (reach[:, None] * _ROW + reach)  # (N, m, m)
+    reach = jnp.arange(-vision, vision + 1, dtype=jnp.int32)
+    offset = reach[:, None] * _ROW + reach[None]
+    window = _number(position)[:, None, None] + offset[None]  # (N, m, m)
     # One elementwise comparison and one sum for all classes: several arrays put together, or a
     # choice between them, cost XLA's CPU code more than the counting.
-    hits = window[:, None, None] == _number(entities)[:, :, None, None]  # (N, c, M, m, m)
-    return hits.sum(2)
+    cell = _number(entities)[None, :, :, None, None]
+    hits = window[:, None, None] == cell  # (N, c, M, m, m)
+    return hits.sum(2, dtype=jnp.int32)
 
 
 _ROW = 2**16

@@ -22,6 +22,7 @@ from jax.typing import ArrayLike
 from sumajax.environments import grid
 from sumajax.environments.types import Observation, Transition
 from sumajax.plain import plain_fields
+from sumajax.records import exportable
 
 STEP_REWARD = -0.05
 """Per agent and step while its work is not done (the originals' TIMESTEP_PENALTY)."""
@@ -39,6 +40,7 @@ RewardMode = Literal["mixed", "cooperative", "competitive"]
 CaptureReward = Literal["default", "second"]
 
 
+@exportable
 @struct.dataclass
 class State:
     """One episode in progress. N agents: predators first, then capture agents."""
@@ -194,11 +196,11 @@ def step(env: PredatorCapturePrey, state: State, actions: chex.Array) -> tuple[S
       ValueError: for a concrete action out of range, a wrong shape or no whole numbers.
     """
     actions = _checked_actions(env, actions)
-    was_on_prey = (state.agents == state.prey).all(-1)
+    was_on_prey = (state.agents == state.prey[None]).all(-1)
     captured = state.captured | (was_on_prey & (actions == grid.CAPTURE))
     moved = grid.move(state.agents, actions, env.shape)
     agents = jnp.where(state.reached[:, None], state.agents, moved)
-    on_prey = (agents == state.prey).all(-1)
+    on_prey = (agents == state.prey[None]).all(-1)
     reached = state.reached | on_prey
     time = state.time + 1
     success = (on_prey & captured).all()
@@ -228,7 +230,7 @@ def view(env: PredatorCapturePrey, state: State) -> chex.Array:
     counts = grid.window_count(state.agents, _entities(env, state), env.vision)
     outside = grid.window_outside(state.agents, env.vision, env.shape)
     # Nobody stands outside, so the counts there are zero.
-    seen = (counts + grid.OUTSIDE * outside[:, None]).astype(jnp.float32)
+    seen = (counts + grid.OUTSIDE * outside[:, None].astype(counts.dtype)).astype(jnp.float32)
     if env.num_capturers == 0:
         return seen
     is_capturer = (env.agent_class == CAPTURER)[:, None, None, None]
@@ -261,8 +263,8 @@ def shortest_steps(env: PredatorCapturePrey, state: State) -> chex.Array:
 
     The bound that no policy beats: the longest shortest path, one step more for a capture agent.
     """
-    distance = jnp.abs(state.agents - state.prey).sum(-1)
-    return (distance + ~state.captured).max()
+    distance = jnp.abs(state.agents - state.prey[None]).sum(-1, dtype=jnp.int32)
+    return (distance + (~state.captured).astype(jnp.int32)).max()
 
 
 def _start(env: PredatorCapturePrey, agents: chex.Array, prey: chex.Array) -> State:
@@ -277,7 +279,7 @@ def _start(env: PredatorCapturePrey, agents: chex.Array, prey: chex.Array) -> St
 
 def _reward(env: PredatorCapturePrey, on_prey: chex.Array, captured: chex.Array) -> chex.Array:
     """(N,) float32 from the flags after the step: the capturing step itself is paid as done."""
-    team_on_prey = on_prey.sum()
+    team_on_prey = on_prey.sum(dtype=jnp.float32)
     paid_on_prey = {
         "mixed": jnp.float32(0.0),
         "cooperative": PREY_REWARD * team_on_prey,

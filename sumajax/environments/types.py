@@ -6,7 +6,10 @@ import chex
 import numpy as np
 from flax import struct
 
+from sumajax.records import exportable
 
+
+@exportable
 @struct.dataclass
 class Observation:
     """What the agents know before they act (paper section IV-A, IV-C).
@@ -18,6 +21,7 @@ class Observation:
     view: chex.Array  # (N, c, m, m) float32: entity counts around the agent, -1 outside the grid
 
 
+@exportable
 @struct.dataclass
 class Transition:
     """What one step did to the team. `terminated` and `truncated` are never both true."""

@@ -31,7 +31,8 @@ def faults_of(loss: chex.Array, gradient_norm: chex.Array, params: chex.ArrayTre
     """
     values = jnp.stack([loss, gradient_norm, optax.tree.norm(params)])
     kinds = jnp.stack([jnp.isnan(values), jnp.isinf(values)], axis=-1)
-    earlier = jnp.cumsum(kinds.any(-1)) - kinds.any(-1)
+    wrong = kinds.any(-1).astype(jnp.int32)
+    earlier = jnp.cumsum(wrong, dtype=jnp.int32) - wrong
     return (kinds & (earlier == 0)[:, None]).reshape(-1).astype(jnp.int32)
 
 

@@ -35,14 +35,18 @@ def hetnet(
     `axis` has no part in it.
     """
     peers = same_class(trajectory.agent_class)
-    size, episodes = peers.sum(0), (trajectory.last & valid).sum(0)[:, None]  # (N,), (E, 1)
-    weight = jnp.where(valid[..., None], jnp.ones_like(trajectory.value), 0)
+    dtype = trajectory.value.dtype
+    size = peers.sum(0)[None, None]  # (1, 1, N)
+    episodes = (trajectory.last & valid).sum(0, dtype=dtype)[:, None]  # (E, 1)
+    weight = jnp.broadcast_to(valid[..., None], trajectory.value.shape).astype(dtype)
     raw = estimate_advantages(trajectory, last_value, config)
     advantages = normalise_by_class(raw, valid, episodes * trajectory.max_steps, peers)
-    policy, entropy = policy_gradient(trajectory.decisions, advantages, weight / episodes)
+    policy, entropy = policy_gradient(trajectory.decisions, advantages, weight / episodes[None])
     target = jax.lax.stop_gradient(trajectory.value) + raw
-    error = ((trajectory.value - target) @ (peers / size)) ** 2  # each agent has its class's
-    critic = (weight * error / size / episode_length(trajectory)[..., None] / episodes).sum()
+    mean = jnp.asarray(peers / size[0], dtype)
+    error = ((trajectory.value - target) @ mean) ** 2  # each agent has its class's
+    length = episode_length(trajectory)[..., None].astype(dtype)
+    critic = (weight * error / size.astype(dtype) / length / episodes[None]).sum()
     loss = (
         config.policy_weight * policy
         + config.value_weight * critic
@@ -66,11 +70,13 @@ def normalise_by_class(
       padded: (E, 1) steps with the padding, episodes x `max_steps`.
       peers: (N, N) 1 where two agents are of one class.
     """
-    entries, steps = padded * peers.sum(0), valid.sum(0)[:, None] * peers.sum(0)  # (E, N)
-    weight = valid[..., None]
-    mean = (weight * x).sum(0) @ peers / entries
-    squares = (weight * (x - mean) ** 2).sum(0) @ peers + (entries - steps) * mean**2
-    return (x - mean) / (jnp.sqrt(squares / (entries - 1)) + STD_EPS)
+    same = jnp.asarray(peers, x.dtype)
+    size, weight = same.sum(0)[None], valid[..., None].astype(x.dtype)  # (1, N), (T, E, 1)
+    entries, steps = padded.astype(x.dtype) * size, weight.sum(0) * size  # (E, N)
+    mean = (weight * x).sum(0) @ same / entries
+    centred = x - mean[None]
+    squares = (weight * centred**2).sum(0) @ same + (entries - steps) * mean**2
+    return centred / (jnp.sqrt(squares / (entries - 1)) + STD_EPS)[None]
 
 
 def same_class(agent_class: tuple[int, ...]) -> np.ndarray:
@@ -82,4 +88,5 @@ def same_class(agent_class: tuple[int, ...]) -> np.ndarray:
 def episode_length(trajectory: Trajectory) -> chex.Array:
     """(T, E): steps of the episode each step belongs to; 1 where the trajectory has not its end."""
     last, steps_taken = trajectory.last, trajectory.steps_taken
-    return returns.discounted_returns(steps_taken * last, 1 - last, jnp.ones_like(steps_taken[0]))
+    ends = last.astype(steps_taken.dtype)
+    return returns.discounted_returns(steps_taken * ends, 1 - ends, jnp.ones_like(steps_taken[0]))

@@ -7,6 +7,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
@@ -41,7 +42,7 @@ class TrainState:
 
 @struct.dataclass
 class Tally:
-    """Sums over updates; `summarise` makes `Metrics` of them."""
+    """Sums over updates; `Metrics` are made of them."""
 
     env_steps: chex.Array  # () int32
     episodes: chex.Array  # () int32 episodes that ended, either way
@@ -58,19 +59,77 @@ class Tally:
 
 @struct.dataclass
 class Metrics:
-    """Figures of an epoch; those of episodes are of the ones that ended in it, NaN if none did."""
+    """Figures of an epoch; those of episodes are of the ones that ended in it, NaN if none did.
 
-    env_steps: chex.Array  # () int32
-    episodes: chex.Array  # () int32
-    steps_taken: chex.Array  # () float32 mean length of an episode
-    success: chex.Array  # () float32 in [0, 1]
-    episode_return: chex.Array  # () float32 undiscounted, mean over agents
-    entropy: chex.Array  # () float32 nats, of the action, per agent that is trained
-    policy_loss: chex.Array  # () float32 per agent that is trained
-    value_loss: chex.Array  # () float32 squared error per agent and step
-    gradient_norm: chex.Array  # () float32 before clipping, mean over updates
-    communication: chex.Array  # () float32 in [0, 1]
+    What crosses the border of a compiled program are the sums; a mean is made of them when it is
+    asked for. A program that handed out NaN for an epoch without an end would be stopped by
+    `jax_debug_nans`. The figures have the leading axes of the sums: (epochs,) or (seeds, epochs).
+    """
+
+    sums: Tally
     fault: chex.Array  # () int32: 0, or what stopped the seed, 1 + its place in `guard.FAULTS`
+
+    @property
+    def env_steps(self) -> chex.Array:
+        """() int32."""
+        return self.sums.env_steps
+
+    @property
+    def episodes(self) -> chex.Array:
+        """() int32."""
+        return self.sums.episodes
+
+    @property
+    def steps_taken(self) -> chex.Array:
+        """() float32: mean length of an episode."""
+        return mean_of(self.sums.steps_taken, self.sums.episodes)
+
+    @property
+    def success(self) -> chex.Array:
+        """() float32 in [0, 1]."""
+        return mean_of(self.sums.success, self.sums.episodes)
+
+    @property
+    def episode_return(self) -> chex.Array:
+        """() float32: undiscounted, mean over agents."""
+        return mean_of(self.sums.episode_return, self.sums.episodes)
+
+    @property
+    def entropy(self) -> chex.Array:
+        """() float32 nats: of the action, per agent that is trained."""
+        return mean_of(self.sums.loss.entropy, self.sums.loss.acting)
+
+    @property
+    def policy_loss(self) -> chex.Array:
+        """() float32: per agent that is trained."""
+        return mean_of(self.sums.loss.policy, self.sums.loss.acting)
+
+    @property
+    def value_loss(self) -> chex.Array:
+        """() float32: squared error per agent and step."""
+        return mean_of(self.sums.loss.value, self.sums.agent_steps)
+
+    @property
+    def gradient_norm(self) -> chex.Array:
+        """() float32: before clipping, mean over updates."""
+        return mean_of(self.sums.gradient_norm, self.sums.updates)
+
+    @property
+    def communication(self) -> chex.Array:
+        """() float32 in [0, 1]."""
+        return mean_of(self.sums.communication, self.sums.env_steps)
+
+
+def mean_of(total: chex.Array, count: chex.Array) -> chex.Array:
+    """(...,) float32: total / count, NaN where there is nothing to take the mean of.
+
+    By NumPy where the numbers are known; traced, it is part of its caller's program.
+    """
+    if isinstance(total, jax.core.Tracer) or isinstance(count, jax.core.Tracer):
+        mean = total.astype(jnp.float32) / jnp.maximum(count, 1).astype(jnp.float32)
+        return jnp.where(count > 0, mean, jnp.nan)
+    total, count = np.asarray(total, np.float32), np.asarray(count, np.float32)
+    return np.divide(total, count, out=np.full(total.shape, np.nan, np.float32), where=count > 0)
 
 
 @dataclass(frozen=True)
@@ -115,7 +174,7 @@ class Learner:
         """20,000 environment steps, or more with `whole_episodes`, which run to their end."""
         updates = self.config.updates_per_epoch
         state, tallies = jax.lax.scan(lambda s, _: self.update(s), state, length=updates)
-        return state, summarise(jax.tree.map(lambda x: x.sum(0), tallies))
+        return state, summarise(_added(tallies))
 
     @stated_precision
     def update(self, state: TrainState) -> tuple[TrainState, Tally]:
@@ -127,10 +186,12 @@ class Learner:
         """
         grads, (actors, tally) = self._gradient(state.params, *self._inputs(state), state.updates)
         grads, tally = self._over_devices((grads, tally))
-        grads = jax.tree.map(lambda g: g / tally.env_steps, grads)
+        grads = jax.tree.map(lambda g: g / tally.env_steps.astype(g.dtype), grads)
         tally = replace(tally, gradient_norm=optax.tree.norm(grads), updates=jnp.int32(1))
         optimiser = make_optimiser(self.config)
-        direction, opt_state = optimiser.update(grads, state.opt_state, state.params)
+        # Its own arithmetic mixes whole numbers and floats, which a program may have forbidden.
+        with jax.numpy_dtype_promotion("standard"):
+            direction, opt_state = optimiser.update(grads, state.opt_state, state.params)
         rate = learning_rate(self.config, state.updates)
         params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
         loss = tally.loss.policy + tally.loss.value + tally.loss.entropy
@@ -170,7 +231,7 @@ class Learner:
         lanes = one_environment_each(actors, draws)
         grads, (actors, tallies) = jax.vmap(gradient, (None, 0, 0, None))(params, *lanes, updates)
         grads = jax.vmap(partial(clip_by_global_norm, limit=limit))(grads)
-        grads, tally = jax.tree.map(lambda x: x.sum(0), (grads, tallies))
+        grads, tally = _added((grads, tallies))
         return grads, (jax.tree.map(lambda x: x[:, 0], actors), tally)
 
     def _objective(
@@ -201,14 +262,15 @@ class Learner:
         """
         if self.axis is None:
             return sums
-        vector, restore = ravel_pytree(sums)
-        return restore(jax.lax.psum(vector, self.axis))
+        vector, restore = ravel_pytree(jax.tree.map(lambda x: x.astype(jnp.float32), sums))
+        added = restore(jax.lax.psum(vector, self.axis))
+        return jax.tree.map(lambda x, y: y.astype(x.dtype), sums, added)
 
     def _keys(self, key: chex.PRNGKey, update: chex.Array) -> chex.PRNGKey:
         """(E,) keys of one update; each belongs to an environment, whatever device that is on."""
         key = jax.random.fold_in(key, update - START)
         num_envs = self.config.num_envs // self.shards
-        number = jnp.arange(num_envs)
+        number = jnp.arange(num_envs, dtype=jnp.int32)
         if self.axis is not None:
             number = number + jax.lax.axis_index(self.axis) * num_envs
         return jax.vmap(partial(jax.random.fold_in, key))(number)
@@ -234,23 +296,23 @@ def until_episode_end(trajectory: Trajectory, least: int) -> chex.Array:
     The originals' collection rule: episodes are never cut, and a process stops at the first end
     after its share of steps (algorithms.md 4.1).
     """
-    step = jnp.arange(trajectory.last.shape[0])[:, None]
-    enough = trajectory.last & (step + 1 >= least)
-    return jnp.cumsum(enough, axis=0) - enough == 0
+    step = jnp.arange(trajectory.last.shape[0], dtype=jnp.int32)[:, None]
+    enough = (trajectory.last & (step + 1 >= least)).astype(jnp.int32)
+    return jnp.cumsum(enough, axis=0, dtype=jnp.int32) - enough == 0
 
 
 def tally_of(trajectory: Trajectory, valid: chex.Array, parts: LossParts) -> Tally:
     """Counts what `valid` (T, E) steps hold."""
-    ended = trajectory.last & valid
-    num_agents = trajectory.value.shape[-1]
+    ended, num_agents = trajectory.last & valid, trajectory.value.shape[-1]
+    env_steps = valid.sum(dtype=jnp.int32)
     return Tally(
-        env_steps=valid.sum(),
-        episodes=ended.sum(),
-        steps_taken=(trajectory.steps_taken * ended).sum(),
-        success=(trajectory.success & ended).sum(),
-        episode_return=(trajectory.episode_return.mean(-1) * ended).sum(),
-        communication=(trajectory.communication.mean(-1) * valid).sum(),
-        agent_steps=valid.sum() * num_agents,
+        env_steps=env_steps,
+        episodes=ended.sum(dtype=jnp.int32),
+        steps_taken=jnp.where(ended, trajectory.steps_taken, 0).sum(dtype=jnp.int32),
+        success=(trajectory.success & ended).sum(dtype=jnp.int32),
+        episode_return=jnp.where(ended, trajectory.episode_return.mean(-1), 0).sum(),
+        communication=jnp.where(valid, trajectory.communication.mean(-1), 0).sum(),
+        agent_steps=env_steps * num_agents,
         loss=jax.lax.stop_gradient(parts),
         gradient_norm=jnp.float32(0),
         updates=jnp.int32(1),
@@ -259,20 +321,13 @@ def tally_of(trajectory: Trajectory, valid: chex.Array, parts: LossParts) -> Tal
 
 
 def summarise(tally: Tally) -> Metrics:
-    """Means of the sums."""
-    return Metrics(
-        env_steps=tally.env_steps,
-        episodes=tally.episodes,
-        steps_taken=tally.steps_taken / tally.episodes,
-        success=tally.success / tally.episodes,
-        episode_return=tally.episode_return / tally.episodes,
-        entropy=tally.loss.entropy / tally.loss.acting,
-        policy_loss=tally.loss.policy / tally.loss.acting,
-        value_loss=tally.loss.value / tally.agent_steps,
-        gradient_norm=tally.gradient_norm / tally.updates,
-        communication=tally.communication / tally.env_steps,
-        fault=guard.first_fault(tally.faults),
-    )
+    """What an epoch's sums say."""
+    return Metrics(sums=tally, fault=guard.first_fault(tally.faults))
+
+
+def _added(tree: Any) -> Any:
+    """Leaves summed over their first axis, each in its own dtype."""
+    return jax.tree.map(lambda x: x.sum(0, dtype=x.dtype), tree)
 
 
 def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None = None) -> Learner:

@@ -102,8 +102,8 @@ def estimate_advantages(
     value, last_value = jax.lax.stop_gradient((trajectory.value, last_value))
     reward = trajectory.reward
     if config.bootstrap_timeouts:
-        reward = reward + config.gamma * trajectory.truncated[..., None] * value
-    ongoing = jnp.broadcast_to(~trajectory.last[..., None], value.shape)
+        reward = reward + config.gamma * trajectory.truncated[..., None].astype(value.dtype) * value
+    ongoing = jnp.broadcast_to(~trajectory.last[..., None], value.shape).astype(value.dtype)
     return returns.generalised_advantages(
         reward, config.gamma * ongoing, value, last_value, config.gae_lambda
     )
@@ -135,7 +135,7 @@ def actor_critic(
     individual = estimate_advantages(trajectory, last_value, config) + value
     target = returns.mix_team(individual, config.team_reward)
     advantages = target - value
-    acting = weight * trajectory.active if config.mask_inactive else weight
+    acting = weight * trajectory.active.astype(weight.dtype) if config.mask_inactive else weight
     advantages = ADVANTAGES[config.advantages](advantages, acting, axis)
     policy, entropy = policy_gradient(trajectory.decisions, advantages, weight, acting)
     critic = (weight * (trajectory.value - target) ** 2).sum()

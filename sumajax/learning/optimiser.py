@@ -14,7 +14,7 @@ def annealed(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
     """What annealing leaves of the learning rate and the entropy weight after so many updates."""
     if not config.anneal_epochs:
         return 1.0
-    done = updates / (config.anneal_epochs * config.updates_per_epoch)
+    done = jnp.asarray(updates, jnp.float32) / (config.anneal_epochs * config.updates_per_epoch)
     return jnp.maximum(1.0 - (1.0 - config.anneal_to) * done, config.anneal_to)
 
 
@@ -27,7 +27,8 @@ def learning_rate(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
     rate = config.learning_rate * annealed(config, updates)
     if not config.warmup_epochs:
         return rate
-    warm = (updates + 1) / (config.warmup_epochs * config.updates_per_epoch)
+    following = jnp.asarray(updates, jnp.float32) + 1
+    warm = following / (config.warmup_epochs * config.updates_per_epoch)
     return rate * jnp.minimum(warm, 1.0)
 
 

@@ -4,11 +4,13 @@ Seeds share nothing, so they are spread over devices first; what devices are lef
 environments of each seed, and add up their gradients.
 """
 
+import contextlib
 import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import chex
@@ -19,6 +21,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from sumajax import hosts
+from sumajax.keys import key_of
 from sumajax.learning.learner import Learner, Metrics, TrainState
 
 SEEDS, ENVS = "seeds", "envs"
@@ -61,20 +64,116 @@ def over_seeds(function: Callable[..., Any], execution: Execution) -> Callable[[
 
 
 def use_cpu_devices(count: int) -> None:
-    """Makes JAX see `count` CPU devices; only before JAX has been used.
+    """Makes JAX see `count` CPU devices; only before JAX has been used (RuntimeError).
 
     One shard of the environments per core, without threads inside the small matrix products of a
     step, took 61 where threads took 76 microseconds per environment step (IC3Net, 5 agents, 100
     environments, two cores). The compiler's first level of effort halves the time to the first
     update and cost no speed after it. A flag that is set already stays as it is.
     """
+    jax.config.update("jax_num_cpu_devices", count)  # first: it raises where JAX has been used
     flags = os.environ.get("XLA_FLAGS", "")
     wanted = {"xla_backend_optimization_level": "1"}
     if count > 1:
         wanted["xla_cpu_multi_thread_eigen"] = "false"
     missing = [f"--{name}={value}" for name, value in wanted.items() if name not in flags]
     os.environ["XLA_FLAGS"] = " ".join([flags, *missing]).strip()
-    jax.config.update("jax_num_cpu_devices", count)
+
+
+def usable_cores(root: Path = Path("/")) -> int:
+    """Cores that this process may keep busy: those of its affinity, within its container's share.
+
+    Args:
+      root: where the files of /proc and /sys are, for tests.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
+    return max(1, min(cores, math.floor(_container_share(root))))
+
+
+def _container_share(root: Path) -> float:
+    """Processor time per time that the control groups of this process have; inf without limit.
+
+    Version 2 writes "QUOTA PERIOD" in cpu.max, version 1 a file for each. A group has no more than
+    the groups it lies in. Seen from inside a container its own group may be the topmost.
+    """
+    shares = [math.inf]
+    for line in _words(root / "proc/self/cgroup", "\n"):
+        _, controllers, path = [*line.split(":", 2), "", ""][:3]
+        group = Path(path.strip("/"))
+        if not controllers:
+            for place in (group, *group.parents):
+                limit = _words(root / "sys/fs/cgroup" / place / "cpu.max")
+                shares.append(_share(*limit) if len(limit) == 2 else math.inf)
+        elif "cpu" in controllers.split(","):
+            for place in (group, *group.parents):
+                files = root / "sys/fs/cgroup/cpu" / place
+                quota, period = (_words(files / f"cpu.cfs_{n}_us") for n in ("quota", "period"))
+                shares.append(_share(quota[0], period[0]) if quota and period else math.inf)
+    return min(shares)
+
+
+def _words(file: Path, separator: str | None = None) -> list[str]:
+    """What a file holds; nothing where it cannot be read."""
+    try:
+        return file.read_text().strip().split(separator)
+    except (OSError, UnicodeDecodeError):
+        return []
+
+
+def _share(quota: str, period: str) -> float:
+    """No quota is "max" in version 2 and -1 in version 1."""
+    limited = quota.isdecimal() and period.isdecimal() and int(period) > 0
+    return int(quota) / int(period) if limited else math.inf
+
+
+def available_devices() -> list[jax.Device]:
+    """This host's devices of the kind that computes.
+
+    Raises:
+      ValueError: where JAX was told to use what the machine has not.
+    """
+    try:
+        return jax.local_devices()
+    except RuntimeError as error:
+        raise ValueError(
+            f"JAX finds no device of the kind that JAX_PLATFORMS={_platforms()!r} asks "
+            f"for ({str(error).splitlines()[0]}); unset JAX_PLATFORMS, or install what drives it."
+        ) from None
+
+
+def choose_devices(
+    num_seeds: int, num_envs: int, asked: int | None = None, num_hosts: int = 1
+) -> int:
+    """How many devices of this host to train on: those asked for, or all that can share the work.
+
+    Where the CPU computes and JAX has not been used yet, it is given a device for each core;
+    otherwise JAX has the devices that it has. Several hosts must have met (`hosts.connect`).
+
+    Raises:
+      ValueError: when more are asked for than there are, or JAX finds none.
+    """
+    if _cpu_may_compute():
+        with contextlib.suppress(RuntimeError):  # JAX has been used
+            use_cpu_devices(asked or most_devices(num_seeds, num_envs, usable_cores(), num_hosts))
+    there_are = len(available_devices())
+    if asked is not None and asked > there_are:
+        raise ValueError(
+            f"{asked} devices asked for, but JAX sees {there_are}; ask for at most those."
+        )
+    return asked or most_devices(num_seeds, num_envs, there_are, num_hosts)
+
+
+def _cpu_may_compute() -> bool:
+    """Unless JAX was told to use something else. With an accelerator CPU devices lie idle."""
+    return _platforms().split(",")[0] in ("", "cpu")
+
+
+def _platforms() -> str:
+    """What JAX was told to use, by the environment or by the program."""
+    return jax.config.read("jax_platforms") or ""
 
 
 def spread(num_seeds: int, num_envs: int, devices: int) -> tuple[int, int]:
@@ -128,7 +227,7 @@ def init_seeds(learner: Learner, seeds: list[int]) -> TrainState:
 
 def seed_keys(seeds: list[int]) -> chex.PRNGKey:
     """(S,) keys."""
-    return jnp.stack([jax.random.key(seed) for seed in seeds])
+    return jnp.stack([key_of(seed) for seed in seeds])
 
 
 def make_train(

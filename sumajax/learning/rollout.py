@@ -12,8 +12,10 @@ from flax import struct
 from sumajax.environments.types import Environment
 from sumajax.learning.windows import windows
 from sumajax.policies.types import Decision, Policy
+from sumajax.records import exportable
 
 
+@exportable
 @struct.dataclass
 class Actors:
     """E environments with the teams that live in them."""
@@ -60,7 +62,7 @@ def start(env: Environment, policy: Policy, keys: chex.PRNGKey) -> Actors:
     return Actors(
         env_state=jax.vmap(env.reset)(keys),
         carry=policy.initial_carry((num_envs,)),
-        episode_return=jnp.zeros((num_envs, env.num_agents)),
+        episode_return=jnp.zeros((num_envs, env.num_agents), jnp.float32),
     )
 
 

@@ -34,7 +34,7 @@ class Windows:
         width, count, num_envs = self.step.shape
 
         def leaf(x: chex.Array) -> chex.Array:
-            rows = x[self.step, jnp.arange(num_envs)]
+            rows = x[self.step, jnp.arange(num_envs, dtype=jnp.int32)[None, None]]
             return rows.reshape(width, count * num_envs, *x.shape[2:])
 
         return jax.tree.map(leaf, tree)
@@ -45,7 +45,7 @@ class Windows:
 
         def leaf(x: chex.Array) -> chex.Array:
             rows = x.reshape(width, count, num_envs, *x.shape[2:])
-            return rows[self.place, self.window, jnp.arange(num_envs)]
+            return rows[self.place, self.window, jnp.arange(num_envs, dtype=jnp.int32)[None]]
 
         return jax.tree.map(leaf, tree)
 
@@ -60,10 +60,10 @@ def windows(begins: chex.Array, gap: int) -> Windows:
     length, num_envs = begins.shape
     shortest = min(GAPS_IN_WINDOW * gap, length)
     width = min(shortest + gap - 1, length)
-    steps = jnp.arange(length)
+    steps, lanes = (jnp.arange(n, dtype=jnp.int32) for n in (length, num_envs))
     following = jax.lax.cummin(jnp.where(begins, steps[:, None], length), reverse=True)
     starts = following[::shortest]  # (K, E)
-    step = jnp.minimum(jnp.arange(width)[:, None, None] + starts, length - 1)
-    window = (starts <= steps[:, None, None]).sum(1) - 1
-    place = steps[:, None] - starts[window, jnp.arange(num_envs)]
+    step = jnp.minimum(jnp.arange(width, dtype=jnp.int32)[:, None, None] + starts[None], length - 1)
+    window = (starts[None] <= steps[:, None, None]).sum(1, dtype=jnp.int32) - 1
+    place = steps[:, None] - starts[window, lanes[None]]
     return Windows(step=step, window=window, place=place)

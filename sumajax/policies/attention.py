@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jax.nn.initializers import normal
 
-from sumajax.policies.layers import product
+from sumajax.policies.layers import add_bias, lift, product
 
 SLOPE = 0.2
 """Of the LeakyReLU below zero."""
@@ -61,7 +61,8 @@ def relation_attention(
     """
     scores = pair_scores(receiver, sender)
     if exclude_self:
-        scores = scores + NO_EDGE * jnp.eye(scores.shape[-2])[..., None]
+        itself = jnp.eye(scores.shape[-2], dtype=scores.dtype)[..., None]
+        scores = scores + lift(NO_EDGE * itself, scores.ndim)
     weights = jax.nn.softmax(scores, axis=-2)
     return gather_messages(weights, messages), weights
 
@@ -86,13 +87,13 @@ class GraphAttention(nn.Module):
     def setup(self) -> None:
         heads, features = self.heads, self.features
         # Xavier with gain sqrt(2); the attention vectors count K as fan-in and O as fan-out.
-        weight_init = normal((4 / (self.in_features + heads * features)) ** 0.5)
-        vector_init = normal((4 / (heads + features)) ** 0.5)
+        weight_init = normal((4 / (self.in_features + heads * features)) ** 0.5, jnp.float32)
+        vector_init = normal((4 / (heads + features)) ** 0.5, jnp.float32)
         self.W = self.param("W", weight_init, (self.in_features, heads * features))
         self.a_i = self.param("a_i", vector_init, (heads, features))
         self.a_j = self.param("a_j", vector_init, (heads, features))
         width = features if self.average else heads * features
-        self.bias = self.param("bias", nn.initializers.zeros_init(), (width,))
+        self.bias = self.param("bias", nn.initializers.zeros_init(), (width,), jnp.float32)
 
     def fold(self) -> chex.Array:
         """(D, K O + 2 K): W, and the attention vectors of receivers and senders seen through it."""
@@ -117,12 +118,12 @@ class GraphAttention(nn.Module):
         scores = pair_scores(receiver, sender)
         if graph is None:
             graph = jnp.ones(scores.shape[-3:-1], scores.dtype)
-        weights = self.weigh(scores, graph)
+        weights = self.weigh(scores, lift(graph, scores.ndim - 1))
         if self.average:  # over senders and heads at once
             y = jnp.einsum("...ijk,...jko->...io", weights, w) / self.heads
         else:
             y = gather_messages(weights, w).reshape(*m.shape[:-1], width)
-        return y + self.bias, weights
+        return add_bias(y, self.bias), weights
 
     def weigh(self, scores: chex.Array, graph: chex.Array) -> chex.Array:
         """Scores (..., N, N, K), graph (..., N, N) -> weights (..., N, N, K) over axis -2.
@@ -131,7 +132,7 @@ class GraphAttention(nn.Module):
         softmax. For a 0/1 graph the normalised value is a masked softmax, the derivative with
         respect to the graph is not.
         """
-        identity = jnp.eye(graph.shape[-1], dtype=graph.dtype)
+        identity = lift(jnp.eye(graph.shape[-1], dtype=graph.dtype), graph.ndim)
         if self.self_loop != "given":
             graph = graph * (1 - identity)
         if self.self_loop == "forced":

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
-from sumajax.policies.layers import Dense
+from sumajax.policies.layers import Dense, lift
 from sumajax.policies.lit_places import lit_places, sum_by_state
 
 EncoderKind = Literal["flat", "lab_gap", "linear"]
@@ -113,8 +113,9 @@ class StateEncoder(nn.Module):
     def _known(self, states: np.ndarray) -> chex.Array:
         """`dense` of the convolutions of states (S, rows, columns, 1), by the places they light."""
         places = lit_places(states, self.conv1.patches, self.conv2.patches)
-        empty = self._convolved(jnp.zeros((1, *states.shape[1:])))
-        inner = nn.relu(self.conv1.dense(places.seen)) * places.exists[:, None, :, None]
+        empty = self._convolved(jnp.zeros((1, *states.shape[1:]), states.dtype))
+        inner = nn.relu(self.conv1.dense(places.seen))
+        inner = inner * places.exists[:, None, :, None].astype(inner.dtype)
         lit = nn.relu(self.conv2.dense(inner.reshape(*places.state.shape, -1)))  # (P, M, channels)
         differs = lit - empty.reshape(-1, 1, lit.shape[-1])
         background = self.dense(empty.reshape(1, -1))
@@ -164,7 +165,9 @@ class ObservationEncoder(nn.Module):
     def see(self, view: chex.Array, sighted: np.ndarray) -> chex.Array:
         """(..., N, 32): the views, encoded; 0 for who does not see."""
         seen = self.view_encoder(view)
-        return seen if sighted.all() else seen * jnp.asarray(sighted, seen.dtype)[:, None]
+        if sighted.all():
+            return seen
+        return seen * lift(sighted[:, None], seen.ndim).astype(seen.dtype)
 
     def view_kernel(self) -> chex.Array:
         """(32, features): turns what is seen into its share of the merged features."""

@@ -26,6 +26,8 @@ from sumajax.policies.encoder import (
 from sumajax.policies.layers import (
     Dense,
     LSTMCell,
+    add_bias,
+    lift,
     product,
     straight_through_bit,
     uniform_fan_in,
@@ -37,6 +39,7 @@ from sumajax.policies.types import (
     decide,
     mask_actions,
 )
+from sumajax.records import exportable
 
 Meta = Literal["normalised", "repo"]
 
@@ -60,6 +63,7 @@ META_SCALE = (10.0, 10.0, 20.0, META_CONSTANT)
 """Divisors of the default descriptor; the raw one starts the critic 100 times too high."""
 
 
+@exportable
 @struct.dataclass
 class HetNetCarry:
     """What the agents remember, predators first."""
@@ -134,7 +138,7 @@ class HetLayer(nn.Module):
 
     def _vectors(self, relation: str) -> tuple[chex.Array, chex.Array]:
         width = self.out_width[receiver_of(relation)]
-        init = normal((4 / ((self.heads + 1) * width)) ** 0.5)
+        init = normal((4 / ((self.heads + 1) * width)) ** 0.5, jnp.float32)
         dst = self.param(f"{relation}_dst", init, (self.heads, width))
         return dst, self.param(f"{relation}_src", init, (self.heads, width))
 
@@ -236,7 +240,8 @@ class HetLayer(nn.Module):
             self.dense[layer][1].shape[0] if vectors is None else self.heads
             for layer, vectors in readings.values()
         ]
-        parts = jnp.split(product(x, kernel) + bias, np.cumsum(widths)[:-1].tolist(), axis=-1)
+        y = add_bias(product(x, kernel), bias)
+        parts = jnp.split(y, np.cumsum(widths)[:-1].tolist(), axis=-1)
         return dict(zip(readings, parts, strict=True))
 
     def _binarize(
@@ -244,7 +249,7 @@ class HetLayer(nn.Module):
     ) -> tuple[chex.Array, chex.Array]:
         """Codes (..., N, bits) -> bits, logits (..., N, bits, 2); one 1 -> 2 layer for all."""
         kernel, bias = self.dense["binarize"]
-        logits = codes[..., None] * kernel[0] + bias
+        logits = add_bias(codes[..., None] * lift(kernel[0], codes.ndim + 1), bias)
         return straight_through_bit(logits, noise), logits
 
     def _decode(
@@ -321,7 +326,8 @@ class HetGraph(nn.Module):
         """
         noises = (noise[..., 0, :, :], noise[..., 1, :, :]) if noise is not None else (None, None)
         layer1, layer2 = folded or (None, None)
-        hidden, first = self.layer1({"P": f_p, "A": f_a, "S": meta}, noises[0], layer1)
+        nodes = {"P": f_p, "A": f_a, "S": lift(meta, f_p.ndim)}
+        hidden, first = self.layer1(nodes, noises[0], layer1)
         out, second = self.layer2(hidden, noises[1], layer2)
         state = nn.relu(out["S"])
         critics = (self.critic_P(state[..., 0, :]), self.critic_A(state[..., 1, :]))
@@ -410,27 +416,27 @@ class HetNet(PolicyModule):
             carry, state_features, x_obs, meta, noise.get("bits"), self.folded()["layers"]
         )
         agent_logits = mask_actions(_join_logits(logits, self.team.num_actions), self.team)
-        batch = value.shape[:-1]
+        batch, capturer = value.shape[:-1], np.array(self.team.agent_class) == 1
         output = PolicyOutput(
             decisions={"action": decide(agent_logits, noise["action"])},
-            value=jnp.where(np.array(self.team.agent_class) == 1, value[..., 1:], value[..., :1]),
+            value=jnp.where(lift(capturer, value.ndim), value[..., 1:], value[..., :1]),
             communication=_talk(exchanges, (*batch, num_p + num_a)),
             attention=_attention_matrix(exchanges[0].weights, num_p, num_a, batch),
         )
         return carry, output
 
     def initial_carry(self, batch_shape: tuple[int, ...]) -> HetNetCarry:
-        state = jnp.zeros((*batch_shape, self.team.num_agents, STATE_FEATURES))
-        view = jnp.zeros((*batch_shape, self.team.class_size(0), VIEW_FEATURES))
+        state = jnp.zeros((*batch_shape, self.team.num_agents, STATE_FEATURES), jnp.float32)
+        view = jnp.zeros((*batch_shape, self.team.class_size(0), VIEW_FEATURES), jnp.float32)
         return HetNetCarry(state, state, view, view)
 
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         shape = (*batch_shape, self.team.num_agents, self.team.num_actions)
         action_key, bit_key = jax.random.split(key)
-        noise = {"action": jax.random.gumbel(action_key, shape)}
+        noise = {"action": jax.random.gumbel(action_key, shape, jnp.float32)}
         if self.bits:
             shape = (*batch_shape, 2, self.team.num_agents, self.bits)
-            noise["bits"] = jax.random.logistic(bit_key, shape)
+            noise["bits"] = jax.random.logistic(bit_key, shape, jnp.float32)
         return noise
 
 
@@ -465,7 +471,7 @@ def _join_logits(logits: dict[str, chex.Array], num_actions: int) -> chex.Array:
 def _talk(exchanges: tuple[Exchange, ...], shape: tuple[int, ...]) -> chex.Array:
     """(..., N): share of the bits an agent set, over both layers; 1 for real-valued messages."""
     bits = [exchange.bits for exchange in exchanges if exchange.bits is not None]
-    return jnp.concatenate(bits, axis=-1).mean(-1) if bits else jnp.ones(shape)
+    return jnp.concatenate(bits, axis=-1).mean(-1) if bits else jnp.ones(shape, jnp.float32)
 
 
 def _attention_matrix(
@@ -480,7 +486,8 @@ def _attention_matrix(
     def block(relation: str) -> chex.Array:
         if relation in weights:
             return weights[relation].mean(-1)
-        return jnp.zeros((*batch, size[receiver_of(relation)], size[sender_of(relation)]))
+        shape = (*batch, size[receiver_of(relation)], size[sender_of(relation)])
+        return jnp.zeros(shape, jnp.float32)
 
     rows = [jnp.concatenate([block(f"p2{to}"), block(f"a2{to}")], axis=-1) for to in ("p", "a")]
     return jnp.concatenate(rows, axis=-2)

@@ -13,12 +13,14 @@ from flax import linen as nn
 from flax import struct
 
 from sumajax.policies.encoder import EncoderKind, ObservationEncoder
-from sumajax.policies.layers import Dense, LSTMCell, side_by_side
+from sumajax.policies.layers import Dense, LSTMCell, lift, side_by_side
 from sumajax.policies.types import Decision, PolicyModule, PolicyOutput, decide, mask_actions
+from sumajax.records import exportable
 
 SILENT, TALK = 0, 1
 
 
+@exportable
 @struct.dataclass
 class IC3NetCarry:
     """What the agents remember."""
@@ -103,7 +105,8 @@ class IC3Net(PolicyModule):
             decisions["gate"] = decide(logits["gate"], noise["gate"])
             gate = decisions["gate"].choice.astype(h.dtype)
         num_agents = h.shape[-2]
-        pairs = talked[..., :, None] * talked[..., None, :] * (1 - jnp.eye(num_agents))
+        pairs = talked[..., :, None] * talked[..., None, :]
+        pairs = pairs * lift(1 - jnp.eye(num_agents, dtype=pairs.dtype), pairs.ndim)
         output = PolicyOutput(
             decisions=decisions,
             value=value,
@@ -114,7 +117,7 @@ class IC3Net(PolicyModule):
 
     def initial_carry(self, batch_shape: tuple[int, ...]) -> IC3NetCarry:
         shape = (*batch_shape, self.team.num_agents)
-        zeros = jnp.zeros((*shape, self.hidden))
+        zeros = jnp.zeros((*shape, self.hidden), jnp.float32)
         # A gated agent starts silent (irrelevant: h is zero); without a gate everybody talks.
         gate = jnp.full(shape, float(self.communicates and not self.gated), zeros.dtype)
         return IC3NetCarry(zeros, zeros, gate)
@@ -122,9 +125,10 @@ class IC3Net(PolicyModule):
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         shape = (*batch_shape, self.team.num_agents)
         action_key, gate_key = jax.random.split(key)
-        noise = {"action": jax.random.gumbel(action_key, (*shape, self.team.num_actions))}
+        action_shape = (*shape, self.team.num_actions)
+        noise = {"action": jax.random.gumbel(action_key, action_shape, jnp.float32)}
         if self.gated:
-            noise["gate"] = jax.random.gumbel(gate_key, (*shape, 2))
+            noise["gate"] = jax.random.gumbel(gate_key, (*shape, 2), jnp.float32)
         return noise
 
 

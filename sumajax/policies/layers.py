@@ -7,7 +7,8 @@ twice the learning rate.
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import chex
 import jax
@@ -15,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 from jax.nn.initializers import Initializer, zeros
+
+ArrayT = TypeVar("ArrayT", np.ndarray, chex.Array)
 
 HE_GAIN = 6**0.5
 """Bound of a uniform distribution of variance 2, for inputs of which ReLU lets half through."""
@@ -28,6 +31,19 @@ def uniform_fan_in(fan_in: float) -> Initializer:
         return jax.random.uniform(key, shape, dtype or jnp.float32, -bound, bound)
 
     return init
+
+
+def lift(x: ArrayT, ndim: int) -> ArrayT:
+    """x with axes of 1 in front, `ndim` in all: broadcasting written out.
+
+    A program may have forbidden JAX to do it unasked (`jax_numpy_rank_promotion="raise"`).
+    """
+    return x.reshape((1,) * (ndim - x.ndim) + x.shape)
+
+
+def add_bias(y: chex.Array, bias: chex.Array) -> chex.Array:
+    """y (..., O) + bias (O,)."""
+    return y + lift(bias, y.ndim)
 
 
 def product(x: chex.Array, kernel: chex.Array) -> chex.Array:
@@ -57,14 +73,14 @@ class Dense(nn.Module):
     def __call__(self, x: chex.Array) -> chex.Array:
         kernel, bias = self.weights(x.shape[-1])
         y = product(x, kernel)
-        return y if bias is None else y + bias
+        return y if bias is None else add_bias(y, bias)
 
     @nn.compact
     def weights(self, in_features: int) -> tuple[chex.Array, chex.Array | None]:
         """kernel (in_features, features) and bias (features,)."""
         fan_in = self.fan_in or in_features
         init = uniform_fan_in(fan_in / HE_GAIN**2 if self.before_relu else fan_in)
-        bias_init = zeros if self.before_relu else init
+        bias_init = partial(zeros, dtype=jnp.float32) if self.before_relu else init
         kernel = self.param("kernel", init, (in_features, self.features))
         return kernel, self.param("bias", bias_init, (self.features,)) if self.use_bias else None
 
@@ -75,7 +91,7 @@ def side_by_side(layers: Sequence[Dense], x: chex.Array) -> list[chex.Array]:
     kernel = jnp.concatenate([kernel for kernel, _ in weights], axis=-1)
     bias = jnp.concatenate([bias for _, bias in weights if bias is not None], axis=-1)
     widths = [layer.features for layer in layers]
-    return jnp.split(product(x, kernel) + bias, np.cumsum(widths)[:-1].tolist(), axis=-1)
+    return jnp.split(add_bias(product(x, kernel), bias), np.cumsum(widths)[:-1].tolist(), axis=-1)
 
 
 class LSTMCell(nn.Module):
@@ -96,11 +112,11 @@ class LSTMCell(nn.Module):
     ) -> tuple[chex.Array, chex.Array]:
         """carry (h, s), each (..., H), and x (..., U) -> the next (h, s); one matrix product."""
         weights = jnp.concatenate([self.w_ih, self.w_hh])
-        return self.step_folded(carry, self.b_ih + self.b_hh, x, weights)
+        return self.step_folded(carry, lift(self.b_ih + self.b_hh, x.ndim), x, weights)
 
     def project_input(self, x: chex.Array) -> chex.Array:
         """x (..., U) -> (..., 4H): its share of z and both biases, for `step_projected`."""
-        return product(x, self.w_ih) + (self.b_ih + self.b_hh)
+        return add_bias(product(x, self.w_ih), self.b_ih + self.b_hh)
 
     def step_projected(
         self, carry: tuple[chex.Array, chex.Array], projected: chex.Array

@@ -18,12 +18,15 @@ from sumajax.policies.encoder import EncoderKind, ObservationEncoder
 from sumajax.policies.layers import (
     Dense,
     LSTMCell,
+    add_bias,
+    lift,
     product,
     side_by_side,
     straight_through_bit,
     uniform_fan_in,
 )
 from sumajax.policies.types import PolicyModule, PolicyOutput, decide, mask_actions
+from sumajax.records import exportable
 
 Setting = Literal["medium", "hard"]
 
@@ -34,6 +37,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 """What differs between the published arguments for 10x10 with 5 agents and 20x20 with 10."""
 
 
+@exportable
 @struct.dataclass
 class MAGICCarry:
     """What the agents remember."""
@@ -75,9 +79,9 @@ class Scheduler(nn.Module):
         kernels = self.fold() if folded is None else folded
         receiver, sender = jnp.split(product(e, kernels["first"]), 2, axis=-1)
         pairs = receiver[..., :, None, :] + sender[..., None, :, :]
-        x = nn.relu(pairs + self.bias_0.reshape(-1))
-        x = nn.relu(product(x, kernels["second"]) + self.bias_1.reshape(-1))
-        logits = product(x, kernels["third"]) + self.bias_2.reshape(-1)
+        x = nn.relu(add_bias(pairs, self.bias_0.reshape(-1)))
+        x = nn.relu(add_bias(product(x, kernels["second"]), self.bias_1.reshape(-1)))
+        logits = add_bias(product(x, kernels["third"]), self.bias_2.reshape(-1))
         return jnp.moveaxis(logits.reshape(*pairs.shape[:-1], self.graphs, 2), -2, -4)
 
 
@@ -192,22 +196,23 @@ class MAGIC(PolicyModule):
         return carry, output
 
     def initial_carry(self, batch_shape: tuple[int, ...]) -> MAGICCarry:
-        zeros = jnp.zeros((*batch_shape, self.team.num_agents, self.hidden))
+        zeros = jnp.zeros((*batch_shape, self.team.num_agents, self.hidden), jnp.float32)
         return MAGICCarry(zeros, zeros)
 
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         n, graphs = self.team.num_agents, 2 if SETTINGS[self.setting]["second_graph"] else 1
         action_key, graph_key = jax.random.split(key)
+        action_shape = (*batch_shape, n, self.team.num_actions)
         return {
-            "action": jax.random.gumbel(action_key, (*batch_shape, n, self.team.num_actions)),
-            "graph": jax.random.logistic(graph_key, (*batch_shape, graphs, n, n)),
+            "action": jax.random.gumbel(action_key, action_shape, jnp.float32),
+            "graph": jax.random.logistic(graph_key, (*batch_shape, graphs, n, n), jnp.float32),
         }
 
 
 def edge_density(graphs: chex.Array) -> chex.Array:
     """Graphs (..., Q, N, N) -> (..., N): share of the others that each sender (column) reaches."""
     num_agents = graphs.shape[-1]
-    to_others = graphs * (1 - jnp.eye(num_agents, dtype=graphs.dtype))
+    to_others = graphs * lift(1 - jnp.eye(num_agents, dtype=graphs.dtype), graphs.ndim)
     return to_others.sum((-3, -2)) / (graphs.shape[-3] * max(num_agents - 1, 1))
 
 

@@ -17,7 +17,9 @@ from flax import linen as nn
 from flax import struct
 
 from sumajax.environments.types import Environment, Observation
+from sumajax.policies.layers import lift
 from sumajax.precision import stated_precision
+from sumajax.records import exportable
 
 FOLDED = "folded"
 """Name of the variables that `Policy.prepare` adds to the parameters."""
@@ -25,6 +27,7 @@ MASKED_LOGIT = -1e9
 """Logit of an action that an agent's class does not have: probability exactly 0 in float32."""
 
 
+@exportable
 @struct.dataclass
 class Decision:
     """One sampled choice per agent, kept with what it was sampled from."""
@@ -33,6 +36,7 @@ class Decision:
     choice: chex.Array  # (..., N) int32 in 0..K-1
 
 
+@exportable
 @struct.dataclass
 class PolicyOutput:
     """What a team decided in one step."""
@@ -155,8 +159,8 @@ class Policy:
         """Fresh parameters."""
         team = self.team
         obs = Observation(
-            state=jnp.zeros((team.num_agents, *team.state_shape)),
-            view=jnp.zeros((team.num_agents, *team.view_shape)),
+            state=jnp.zeros((team.num_agents, *team.state_shape), jnp.float32),
+            view=jnp.zeros((team.num_agents, *team.view_shape), jnp.float32),
         )
         draws = jax.eval_shape(lambda: self.sample_noise(key, ()))  # the key is for `init` alone
         noise = jax.tree.map(lambda draw: jnp.zeros(draw.shape, draw.dtype), draws)
@@ -172,8 +176,6 @@ class Policy:
         self, params: Any, carry: Any, obs: Observation, key: chex.PRNGKey
     ) -> tuple[Any, PolicyOutput]:
         """One team step: obs.state (..., N, 1, rows, columns), obs.view (..., N, c, m, m)."""
-        chex.assert_shape(obs.state, (..., *self.team.state_shape))
-        chex.assert_shape(obs.view, (..., *self.team.view_shape))
         return self.apply_with(params, carry, obs, self.sample_noise(key, obs.view.shape[:-4]))
 
     @stated_precision
@@ -181,6 +183,8 @@ class Policy:
         self, params: Any, carry: Any, obs: Observation, noise: Any
     ) -> tuple[Any, PolicyOutput]:
         """`apply` with given random numbers; all zeros make every choice the likeliest."""
+        chex.assert_shape(obs.state, (..., *self.team.state_shape))
+        chex.assert_shape(obs.view, (..., *self.team.view_shape))
         step = self.module.apply(params, carry, obs, noise, method=self.module.encode_and_step)
         return cast(tuple[Any, PolicyOutput], step)
 
@@ -217,4 +221,4 @@ def decide(logits: chex.Array, gumbel: chex.Array) -> Decision:
 def mask_actions(logits: chex.Array, team: TeamSpec) -> chex.Array:
     """(..., N, num_actions) logits with the actions an agent does not have at `MASKED_LOGIT`."""
     mask = np.array(team.action_mask)
-    return logits if mask.all() else jnp.where(mask, logits, MASKED_LOGIT)
+    return logits if mask.all() else jnp.where(lift(mask, logits.ndim), logits, MASKED_LOGIT)

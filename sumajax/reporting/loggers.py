@@ -116,20 +116,31 @@ class WeightsAndBiases:
 
     Figures are called <arm>/seed_<n>/<column>, over <arm>/env_steps. The project is `sumajax`; the
     library's own variables (WANDB_PROJECT, WANDB_MODE=offline and so on) come first.
+
+    Raises:
+      ValueError: where W&B starts no run, as without a key; before anything is trained.
     """
 
     def __init__(self, directory: Path, config: Mapping[str, Any]) -> None:
         import wandb
 
         self._known: set[tuple[str, int]] = set()
-        self._run = wandb.init(
-            project=os.environ.get("WANDB_PROJECT", "sumajax"),
-            name=directory.name,
-            dir=str(directory),
-            config=dict(config),
-            id=_identity(directory / "wandb-id.txt"),
-            resume="allow",
-        )
+        try:
+            self._run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT", "sumajax"),
+                name=directory.name,
+                dir=str(directory),
+                config=dict(config),
+                id=_identity(directory / "wandb-id.txt"),
+                resume="allow",
+            )
+        except Exception as error:  # its own, the network's, the login's: there is no common kind
+            said = " ".join(str(error).split()) or type(error).__name__
+            raise ValueError(
+                f"Weights & Biases starts no run ({said.rstrip('.')}); run `wandb login` or set "
+                "WANDB_API_KEY, set WANDB_MODE=offline to keep the run here, or leave wandb out of "
+                "--log."
+            ) from None
 
     def resume(self, arm: str, env_steps: int) -> None:
         """Nothing to do: W&B takes no figure back, a later one at the same place follows it."""

@@ -15,6 +15,8 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 from rich.text import Text
 
+from sumajax.reporting.output import outlet
+
 WIDTH = 80
 """Columns of a table in a file, where there is no terminal to ask, or as many as it needs."""
 WIDEST = 1000
@@ -75,6 +77,8 @@ class Progress:
             ...
             progress.advance("source", 5, {"steps_taken": 12.3, "success": 0.97})
 
+    Nothing that it prints can end a run (`reporting.output`).
+
     Args:
       stages: epochs of each stage, in the order they run; stages of 0 epochs do not appear.
       file: where to write; None is standard error, so that results can be piped.
@@ -91,7 +95,7 @@ class Progress:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.stages = {name: _Stage(epochs) for name, epochs in stages.items() if epochs > 0}
-        self._file = sys.stderr if file is None else file
+        self._file = outlet(sys.stderr if file is None else file)
         self._interval = interval
         self._clock = clock
         self._display: _Display | None = None
@@ -282,8 +286,11 @@ def result_table(rows: Sequence[Mapping[str, Any]], title: str | None = None) ->
 def print_table(
     rows: Sequence[Mapping[str, Any]], title: str | None = None, file: TextIO | None = None
 ) -> None:
-    """Prints a `result_table`: in a terminal at its width, in a file whole and plain."""
-    file, table = sys.stdout if file is None else file, result_table(rows, title)
+    """Prints a `result_table`: in a terminal at its width, in a file whole and plain.
+
+    Raises nothing, whatever becomes of the terminal or the file; see `reporting.output`.
+    """
+    file, table = outlet(sys.stdout if file is None else file), result_table(rows, title)
     if file.isatty():
         Console(file=file).print(table)
         return

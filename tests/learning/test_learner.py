@@ -15,7 +15,7 @@ from trajectories import TINY_TASK, random_trajectory, tiny_learner
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import Learner, make_learner, preset
-from sumajax.learning.learner import summarise, tally_of, until_episode_end
+from sumajax.learning.learner import mean_of, summarise, tally_of, until_episode_end
 from sumajax.learning.losses import LossParts, estimate_advantages, policy_gradient
 from sumajax.learning.rollout import last_value, rollout
 from sumajax.policies import make_policy
@@ -259,6 +259,15 @@ class TestFigures:
         assert np.isfinite(metrics.value_loss).all()
         np.testing.assert_array_equal(metrics.steps_taken[2], 3)
         np.testing.assert_array_equal(metrics.episode_return[2], 3)
+        sums = jax.tree.leaves(metrics)
+        assert all(np.isfinite(leaf).all() for leaf in sums), "a program hands out no NaN"
+
+    @pytest.mark.parametrize("count", [0, 4])
+    def test_a_mean_traced_and_not(self, count):
+        total, count = jnp.int32(3), jnp.int32(count)
+        expected = 0.75 if count else np.nan
+        np.testing.assert_array_equal(mean_of(total, count), np.float32(expected))
+        np.testing.assert_array_equal(jax.jit(mean_of)(total, count), np.float32(expected))
 
     def test_an_epoch(self):
         _, metrics = learner().train(fresh(0), 2)

@@ -1,6 +1,7 @@
 """Several seeds and several devices: the same numbers however they are spread."""
 
 import json
+import os
 import subprocess
 import sys
 from functools import partial
@@ -119,3 +120,144 @@ def test_the_most_devices_that_seeds_and_environments_spread_over(
     over_seeds, over_envs = parallel.spread(num_seeds, num_envs, expected)
     assert over_seeds * over_envs == expected
     assert num_seeds % over_seeds == num_envs % over_envs == 0
+
+
+class TestCores:
+    """A root directory stands for the files of /proc and /sys."""
+
+    @pytest.fixture(autouse=True)
+    def _eight(self, monkeypatch):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+        monkeypatch.setattr(os, "cpu_count", lambda: 64)
+
+    def files(self, root, **content):
+        for name, text in content.items():
+            file = root / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
+        return root
+
+    def test_those_of_the_affinity_not_of_the_machine(self, tmp_path):
+        assert parallel.usable_cores(tmp_path) == 8
+
+    def test_a_system_without_affinity(self, tmp_path, monkeypatch):
+        monkeypatch.delattr(os, "sched_getaffinity")
+        assert parallel.usable_cores(tmp_path) == 64
+
+    @pytest.mark.parametrize(
+        ("limit", "cores"),
+        [("200000 100000", 2), ("250000 100000", 2), ("50000 100000", 1), ("max 100000", 8)],
+    )
+    @pytest.mark.parametrize("own", ["/", "/pod/box"])
+    def test_version_2(self, tmp_path, limit, cores, own):
+        files = {"proc/self/cgroup": f"0::{own}\n", f"sys/fs/cgroup{own}/cpu.max": f"{limit}\n"}
+        assert parallel.usable_cores(self.files(tmp_path, **files)) == cores
+
+    def test_a_group_has_no_more_than_those_around_it(self, tmp_path):
+        files = {
+            "proc/self/cgroup": "0::/pod/box\n",
+            "sys/fs/cgroup/pod/cpu.max": "300000 100000\n",
+            "sys/fs/cgroup/pod/box/cpu.max": "600000 100000\n",
+        }
+        assert parallel.usable_cores(self.files(tmp_path, **files)) == 3
+
+    @pytest.mark.parametrize(("quota", "cores"), [("400000", 4), ("-1", 8)])
+    @pytest.mark.parametrize("inside", ["", "docker/1f"], ids=["topmost", "its own"])
+    def test_version_1(self, tmp_path, quota, cores, inside):
+        files = {
+            "proc/self/cgroup": "4:memory:/docker/1f\n3:cpu,cpuacct:/docker/1f\n",
+            f"sys/fs/cgroup/cpu/{inside}/cpu.cfs_quota_us": quota,
+            f"sys/fs/cgroup/cpu/{inside}/cpu.cfs_period_us": "100000",
+        }
+        assert parallel.usable_cores(self.files(tmp_path, **files)) == cores
+
+
+class TestChoice:
+    """Of devices; JAX has been used in these tests, so that it has what it has."""
+
+    @pytest.fixture
+    def has(self, monkeypatch):
+        def given(count):
+            monkeypatch.setattr(jax, "local_devices", lambda: [object()] * count)
+
+        return given
+
+    @pytest.mark.parametrize(
+        ("devices", "num_seeds", "num_envs", "expected"),
+        [(1, 3, 50, 1), (8, 3, 50, 6), (4, 4, 7, 4)],
+    )
+    def test_as_many_as_can_share_the_work(self, has, devices, num_seeds, num_envs, expected):
+        has(devices)
+        assert parallel.choose_devices(num_seeds, num_envs) == expected
+
+    def test_as_many_as_asked_for(self, has):
+        has(8)
+        assert parallel.choose_devices(3, 50, asked=2) == 2
+
+    def test_more_than_there_are(self, has):
+        has(1)
+        with pytest.raises(ValueError, match="4 devices asked for, but JAX sees 1;"):
+            parallel.choose_devices(1, 100, asked=4)
+
+    def test_a_machine_with_one_gpu_and_many_cores(self, has, monkeypatch):
+        """No CPU device is made, and no core counted."""
+        has(1)
+        monkeypatch.setattr(parallel, "usable_cores", lambda: 64)
+        monkeypatch.setattr(parallel, "use_cpu_devices", lambda count: pytest.fail("made some"))
+        platforms = jax.config.jax_platforms
+        jax.config.update("jax_platforms", "cuda,cpu")
+        try:
+            assert parallel.choose_devices(1, 64) == 1
+        finally:
+            jax.config.update("jax_platforms", platforms)
+
+
+def run_program(program, *arguments, **variables):
+    """In a process of its own, whose JAX has not been used."""
+    inherited = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_PLATFORMS")}
+    return subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        env={**inherited, **variables},
+        capture_output=True,
+        text=True,
+    )
+
+
+PROGRAM = """
+import os, sys
+import jax
+from sumajax.learning import parallel
+os.sched_getaffinity = lambda _: {0, 1, 2}
+if sys.argv[1] == "used":
+    jax.devices()
+print(parallel.choose_devices(3, 50), jax.local_device_count())
+"""
+
+
+@pytest.mark.parametrize(
+    ("state", "variables", "expected"),
+    [
+        ("fresh", {}, "3 3"),
+        ("fresh", {"JAX_PLATFORMS": "cpu"}, "3 3"),
+        ("used", {}, "1 1"),
+        ("used", {"XLA_FLAGS": "--xla_force_host_platform_device_count=6"}, "6 6"),
+    ],
+)
+def test_cpu_devices_are_made_for_the_cores_unless_jax_has_been_used(state, variables, expected):
+    said = run_program(PROGRAM, state, **variables)
+    assert said.stdout.split("\n")[0] == expected, said.stderr
+
+
+@pytest.mark.parametrize("platforms", ["cuda", "nonsense"])
+def test_a_platform_that_the_machine_has_not(platforms):
+    program = (
+        "from sumajax.learning import parallel\n"
+        "try: parallel.choose_devices(1, 4)\n"
+        "except ValueError as error: print(error)"
+    )
+    said = run_program(program, JAX_PLATFORMS=platforms)
+    assert len(said.stdout.splitlines()) == 1, said.stderr
+    assert said.stdout.startswith(
+        f"JAX finds no device of the kind that JAX_PLATFORMS='{platforms}'"
+    )
+    assert "unset JAX_PLATFORMS" in said.stdout

@@ -117,6 +117,20 @@ def test_wandb_is_one_run_that_goes_on(runs, tmp_path):
     assert runs[0].finished
 
 
+def test_wandb_without_a_key_is_one_sentence(tmp_path, monkeypatch):
+    """The library raises kinds of its own, at the start: nothing has been trained."""
+
+    def init(**options):
+        raise RuntimeError("api_key not configured (no-tty).\ncall wandb.login(key=[your_api_key])")
+
+    monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=init))
+    with pytest.raises(ValueError, match=r"starts no run \(api_key not configured") as raised:
+        Loggers(["wandb"], tmp_path)
+    said = str(raised.value)
+    assert "\n" not in said
+    assert all(mend in said for mend in ("wandb login", "WANDB_API_KEY", "WANDB_MODE=offline"))
+
+
 def test_what_has_no_value_is_left_out(writers, tmp_path):
     empty = [{**row, "steps_taken": math.nan} for row in rows(epochs=1)]
     with Loggers(["tensorboard"], tmp_path) as loggers:
