@@ -54,12 +54,15 @@ def evaluate(
       key: the policy's own randomness; ignored when greedy.
       greedy: every choice of the policy (action, gate, edge, bit) is its likeliest one; may be
         traced, so both kinds share one compiled program.
+
+    Raises:
+      ValueError: when the policy was shaped for another task.
     """
+    policy.check_fits(env)
     features, params = state_features(env, policy, params), policy.prepare(params)
 
     def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
-        noise = policy.sample_noise(key, actors.episode_return.shape[:1])
-        noise = jax.tree.map(lambda x: jnp.where(greedy, 0.0, x), noise)
+        noise = policy.sample_noise(key, actors.episode_return.shape[:1], greedy)
         carry, output = act(env, policy, params, features, actors, noise)
         return carry, output.action
 
@@ -157,13 +160,14 @@ class Agent:
     def act(
         self, carry: Any, obs: Observation, key: chex.PRNGKey, *, greedy: bool = False
     ) -> tuple[Any, chex.Array]:
-        """(next carry, actions (..., N) int32) for obs.state (..., N, 1, rows, columns)."""
-        if greedy:
-            noise = self.policy.sample_noise(key, obs.view.shape[:-4])
-            noise = jax.tree.map(jnp.zeros_like, noise)
-            carry, output = self.policy.apply_with(self.params, carry, obs, noise)
-        else:
-            carry, output = self.policy.apply(self.params, carry, obs, key)
+        """(next carry, actions (..., N) int32) for obs.state (..., N, C, rows, columns).
+
+        Raises:
+          ValueError: for the observation, or the carry, of another team or grid.
+        """
+        self.policy.check_step(carry, obs)
+        noise = self.policy.sample_noise(key, obs.view.shape[:-4], greedy)
+        carry, output = self.policy.apply_with(self.params, carry, obs, noise)
         return carry, output.action
 
 

@@ -6,9 +6,9 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
+from sumajax.environments.states import listed_states
 from sumajax.environments.types import Environment
 from sumajax.learning.windows import windows
 from sumajax.policies.types import Decision, Policy
@@ -88,10 +88,9 @@ def select(condition: chex.Array, if_true: Any, if_false: Any) -> Any:
 
 def state_features(env: Environment, policy: Policy, params: Any) -> chex.Array | None:
     """(S, F) features of every state tensor the task has, or None where it has too many to list."""
-    with jax.ensure_compile_time_eval():  # an encoder can make use of what is in it
-        table = env.state_table()
-        known = None if table is None else np.asarray(table)
-    return None if known is None else policy.encode_states(params, known)
+    with jax.ensure_compile_time_eval():  # an encoder can make use of what is in them
+        states = listed_states(env)
+    return None if states is None else policy.encode_listed(params, states)
 
 
 def act(
@@ -218,10 +217,7 @@ def last_value(env: Environment, policy: Policy, params: Any, actors: Actors) ->
     """(E, N) value of what the agents see now: the bootstrap after a rollout. No gradient."""
     params, actors = jax.lax.stop_gradient((params, actors))
     num_envs = actors.episode_return.shape[0]
-    # Zero noise: where messages depend on a draw (edges, bits), those of the likeliest draw.
-    noise = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype),
-        jax.eval_shape(lambda: policy.sample_noise(jax.random.key(0), (num_envs,))),
-    )
+    # Where messages depend on a draw (edges, bits), those of the likeliest draw.
+    noise = policy.greedy_noise((num_envs,))
     features = state_features(env, policy, params)
     return act(env, policy, params, features, actors, noise)[1].value

@@ -5,13 +5,14 @@ because it flattens; `lab_gap` is the encoder of the authors' later public branc
 the grid and so cannot tell most inner cells of a native grid apart; `linear` has no convolution.
 """
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import chex
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
+from sumajax.environments.states import SparseStates
 from sumajax.policies.layers import Dense
 from sumajax.policies.lit_places import lit_places, sum_by_state
 
@@ -35,8 +36,9 @@ def patches(
     """(..., rows, columns, c) -> (..., rows', columns', kernel^2 c): what a convolution looks at.
 
     A convolution written as one product with these is a matrix product, forwards and back; XLA's
-    own convolutions of a few channels took four times as long on a CPU.
+    own convolutions of a few channels took four times as long on a CPU. Of a NumPy array it is one.
     """
+    xp: Any = np if isinstance(x, np.ndarray) else jnp
     out = []
     for axis in (-3, -2):
         side = x.shape[axis]
@@ -44,9 +46,9 @@ def patches(
         missing = max((steps - 1) * stride + kernel - side, 0)
         widths = [(0, 0)] * x.ndim
         widths[axis] = (missing // 2, missing - missing // 2)
-        x = jnp.pad(x, widths) if missing else x
+        x = xp.pad(x, widths) if missing else x
         out.append((steps - 1) * stride + 1)
-    return jnp.concatenate(
+    return xp.concatenate(
         [
             x[..., a : a + out[0] : stride, b : b + out[1] : stride, :]
             for a in range(kernel)
@@ -75,10 +77,10 @@ class Conv(nn.Module):
 
 
 class StateEncoder(nn.Module):
-    """(S, 1, rows, columns) state tensors -> (S, 128).
+    """(S, C, rows, columns) state tensors -> (S, 128).
 
-    A NumPy array is known when the program is compiled: `flat` then computes only what differs from
-    an empty grid (`lit_places`), the same to rounding.
+    Sparse states and NumPy arrays are known when the program is compiled: `flat` then computes only
+    what differs from an empty grid (`lit_places`), the same to rounding.
     """
 
     kind: EncoderKind = "flat"
@@ -95,9 +97,13 @@ class StateEncoder(nn.Module):
         else:
             self.dense = Dense(STATE_FEATURES, fan_in=reached, before_relu=True)
 
-    def __call__(self, states: chex.Array) -> chex.Array:
+    def __call__(self, states: chex.Array | SparseStates) -> chex.Array:
         if self.kind == "flat" and isinstance(states, np.ndarray):
-            return nn.relu(self._known(np.moveaxis(states, -3, -1)))
+            states = SparseStates.of(states)
+        if self.kind == "flat" and isinstance(states, SparseStates):
+            return nn.relu(self._known(states))
+        if isinstance(states, SparseStates):
+            states = states.dense()
         x = jnp.moveaxis(states, -3, -1)
         if self.kind != "linear":
             x = self._convolved(x)
@@ -108,10 +114,11 @@ class StateEncoder(nn.Module):
     def _convolved(self, x: chex.Array) -> chex.Array:
         return nn.relu(self.conv2(nn.relu(self.conv1(x))))
 
-    def _known(self, states: np.ndarray) -> chex.Array:
-        """`dense` of the convolutions of states (S, rows, columns, 1), by the places they light."""
+    def _known(self, states: SparseStates) -> chex.Array:
+        """`dense` of the convolutions of the states, by the places they light."""
         places = lit_places(states, self.conv1.patches, self.conv2.patches)
-        empty = self._convolved(jnp.zeros((1, *states.shape[1:])))
+        channels, rows, columns = states.shape
+        empty = self._convolved(jnp.zeros((1, rows, columns, channels)))
         inner = nn.relu(self.conv1.dense(places.seen)) * places.exists[:, None, :, None]
         lit = nn.relu(self.conv2.dense(inner.reshape(*places.state.shape, -1)))  # (P, M, channels)
         differs = lit - empty.reshape(-1, 1, lit.shape[-1])
@@ -149,8 +156,8 @@ class ObservationEncoder(nn.Module):
         self.merge_state = Dense(self.features, fan_in=fan_in)
         self.merge_view = Dense(self.features, use_bias=False, fan_in=fan_in)
 
-    def encode_states(self, states: chex.Array) -> chex.Array:
-        """(S, 1, rows, columns) -> (S, features)."""
+    def encode_states(self, states: chex.Array | SparseStates) -> chex.Array:
+        """(S, C, rows, columns) -> (S, features)."""
         return self.merge_state(self.state_encoder(states))
 
     def __call__(

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sumajax.environments import PredatorPrey
+from sumajax.environments import PredatorPrey, SparseStates
 from sumajax.policies.encoder import StateEncoder
 from sumajax.policies.lit_places import lit_places, sum_by_state
 from sumajax.upsampling import StateUpsampled
@@ -62,7 +62,7 @@ def test_known_states_have_the_features_and_gradients_of_states_given(name):
 def test_only_lit_places_are_kept():
     """A one-hot cell of a 20x20 grid lights at most 3x3 of 10x10 places."""
     encoder = StateEncoder().bind(parameters(jnp.zeros((1, 1, 20, 20))))
-    states = np.moveaxis(np.asarray(PredatorPrey(size=20).state_table()), 1, -1)
+    states = PredatorPrey(size=20).sparse_states()
     places = lit_places(states, encoder.conv1.patches, encoder.conv2.patches)
     of_state = np.bincount(places.state.ravel(), minlength=401)
     assert places.num_states == 400
@@ -75,8 +75,7 @@ def test_only_lit_places_are_kept():
 
 
 def test_sums_by_state_leave_out_what_fills_up():
-    states = np.zeros((2, 4, 4, 1), np.float32)
-    states[1, 0, 0] = 1
+    states = SparseStates(np.array([[0], [0]]), np.array([[0.0], [1.0]]), (1, 4, 4))
     encoder = StateEncoder().bind(parameters(jnp.zeros((1, 1, 4, 4))))
     places = lit_places(states, encoder.conv1.patches, encoder.conv2.patches)
     ones = jnp.ones((*places.state.shape, 3))
