@@ -8,14 +8,16 @@ from sumajax.reporting.replay.pictures import (
     write_gif,
     write_strip,
 )
-from sumajax.reporting.replay.recording import Episode, record_episode
+from sumajax.reporting.replay.recording import Episode, Recording, record, record_episode
 
 __all__ = [
     "Episode",
+    "Recording",
     "caption",
     "draw_frame",
     "frame_artists",
     "messages",
+    "record",
     "record_episode",
     "seen_cells",
     "spots",

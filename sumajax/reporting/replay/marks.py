@@ -41,10 +41,10 @@ def frame_artists(episode: Episode, moment: int, cell_points: float) -> list[Art
     """
     places, radius = spots(episode.agents[moment])
     # Whoever stands on the prey stands in front of it: its tips still show.
-    occupied = (episode.agents[moment] == episode.prey).all(-1).any()
+    occupied = (episode.agents[moment] == episode.prey[moment]).all(-1).any()
     artists = [
         *_sight(episode, moment),
-        *_prey(episode.prey, 0.5 if occupied else 0.32),
+        *_prey(episode.prey[moment], 0.5 if occupied else 0.32),
         _title(episode, moment),
     ]
     if moment < episode.num_steps:
@@ -63,7 +63,7 @@ def caption(episode: Episode, moment: int) -> str:
     step = f"step {moment}/{episode.num_steps}"
     if moment == episode.num_steps:
         return f"{step}: {'done' if episode.success else 'not done'}"
-    there = int((episode.agents[moment] == episode.prey).all(-1).sum())
+    there = int((episode.agents[moment] == episode.prey[moment]).all(-1).sum())
     return f"{step}: {there}/{episode.num_agents} on prey"
 
 

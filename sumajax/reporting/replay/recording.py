@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sumajax.environments.types import Environment
+from sumajax.environments.wrapper import unwrapped
 from sumajax.policies.types import Policy
 
 PREDATOR, CAPTURER = 0, 1
@@ -24,7 +25,7 @@ class Episode:
     """
 
     agents: np.ndarray  # (T+1, N, 2) int cells (row, column)
-    prey: np.ndarray  # (2,) int cell
+    prey: np.ndarray  # (T+1, 2) int cells; given as (2,), one that stands still
     reached: np.ndarray  # (T+1, N) bool: has stood on the prey
     captured: np.ndarray  # (T+1, N) bool: nothing left to capture; true for predators throughout
     actions: np.ndarray  # (T, N) int: 0 up, 1 right, 2 down, 3 left, 4 stay, 5 capture
@@ -39,9 +40,11 @@ class Episode:
 
     def __post_init__(self) -> None:
         steps, agents = self.actions.shape
+        if np.shape(self.prey) == (2,):
+            object.__setattr__(self, "prey", np.broadcast_to(self.prey, (steps + 1, 2)))
         expected = {
             "agents": (steps + 1, agents, 2),
-            "prey": (2,),
+            "prey": (steps + 1, 2),
             "reached": (steps + 1, agents),
             "captured": (steps + 1, agents),
             "attention": (steps, agents, agents),
@@ -81,69 +84,95 @@ def record_episode(
       greedy: take the likeliest choice everywhere instead of sampling.
 
     Raises:
-      ValueError: for a task whose state has no agents and prey on a grid.
+      ValueError: for a task whose state has no agents and prey on a grid, or a policy that was
+        shaped for another task.
     """
-    task = getattr(env, "env", env)  # StateUpsampled changes what is observed, not the grid
+    task = unwrapped(env)  # a wrapper changes what is observed, not the grid
     state = jax.eval_shape(task.reset, key)
     if not all(hasattr(state, name) for name in ("agents", "prey", "reached", "captured")):
         raise ValueError(
             f"a replay needs agents and prey on a grid; {type(task).__name__} has not."
         )
-    first, steps = _run(env, policy, params, key, greedy)
-    steps = jax.device_get(steps)
-    length = int(np.argmax(steps["ended"])) + 1 if steps["ended"].any() else len(steps["ended"])
-
-    def whole(name: str) -> np.ndarray:
-        return np.concatenate([np.asarray(getattr(first, name))[None], steps[name][:length]])
-
+    recording = record(env, policy, params, key, greedy)
+    states = recording.states
     return Episode(
-        agents=whole("agents"),
-        prey=np.asarray(first.prey),
-        reached=whole("reached"),
-        captured=whole("captured"),
-        actions=steps["actions"][:length],
-        attention=steps["attention"][:length],
-        communication=steps["communication"][:length],
-        reward=steps["reward"][:length],
+        agents=np.asarray(states.agents),
+        prey=np.asarray(states.prey),
+        reached=np.asarray(states.reached),
+        captured=np.asarray(states.captured),
+        actions=recording.actions,
+        attention=recording.attention,
+        communication=recording.communication,
+        reward=recording.reward,
         agent_class=np.asarray(env.agent_class),
         size=(task.state_shape[1], task.state_shape[2]),
         vision=(env.view_shape[-1] - 1) // 2,
         capture_vision=getattr(task, "capture_vision", None),
-        success=bool(steps["success"][length - 1]),
+        success=recording.success,
+    )
+
+
+@dataclass(frozen=True)
+class Recording:
+    """T steps of N agents of any task, for whoever draws it."""
+
+    states: Any  # leaves (T+1, ...): the task's own states, before each step and after the last
+    actions: np.ndarray  # (T, N) int
+    attention: np.ndarray  # (T, N, N) weight of sender j (column) at receiver i (row)
+    communication: np.ndarray  # (T, N) in [0, 1]: share of its means an agent used to talk
+    reward: np.ndarray  # (T, N) of each step
+    success: bool  # the team was done at the end
+
+
+def record(
+    env: Environment, policy: Policy, params: Any, key: chex.PRNGKey, greedy: bool = False
+) -> Recording:
+    """Runs one episode of any task to its end.
+
+    Args:
+      greedy: take the likeliest choice everywhere instead of sampling.
+
+    Raises:
+      ValueError: when the policy was shaped for another task.
+    """
+    policy.check_fits(env)
+    states, steps, ended, success = _run(env, policy, params, key, greedy)
+    ended = np.asarray(ended)
+    length = int(ended.argmax()) + 1 if ended.any() else len(ended)
+    return Recording(
+        states=jax.tree.map(lambda x: x[: length + 1], states),
+        success=bool(success[length - 1]),
+        **{name: np.asarray(of_steps[:length]) for name, of_steps in steps.items()},
     )
 
 
 @partial(jax.jit, static_argnames=("env", "policy"))
 def _run(
     env: Environment, policy: Policy, params: Any, key: chex.PRNGKey, greedy: chex.Array
-) -> tuple[Any, dict[str, chex.Array]]:
-    """The first state, and `max_steps` steps from it; what follows the end is cut off later."""
-    reset_key, noise_key = jax.random.split(key)
-    first = env.reset(reset_key)
-    noise = policy.sample_noise(noise_key, (env.max_steps,))
-    noise = jax.tree.map(lambda numbers: jnp.where(greedy, 0, numbers), noise)
+) -> tuple[Any, dict[str, chex.Array], chex.Array, chex.Array]:
+    """`max_steps` steps; what follows the end is cut off later.
 
-    def step(loop: tuple[Any, Any], noise_t: Any) -> tuple[tuple[Any, Any], dict[str, chex.Array]]:
+    Returns:
+      states, leaves (max_steps + 1, ...); what `Recording` has of each step; and whether it ended
+      the episode, and whether with success (max_steps,).
+    """
+    reset_key, noise_key = jax.random.split(key)
+    noise = policy.sample_noise(noise_key, (env.max_steps,), greedy)
+
+    def step(loop: tuple[Any, Any], noise_t: Any) -> tuple[tuple[Any, Any], Any]:
         state, carry = loop
-        # IC3Net's gate of this step was chosen one step ahead, and its output holds the next one.
-        gate = getattr(carry, "gate", None)
-        team_step: Any = policy.module.apply(
-            params, carry, env.observe(state), noise_t, method=policy.module.encode_and_step
-        )
-        carry, output = team_step
-        state, transition = env.step(state, output.action)
-        record = {
-            "agents": state.agents,
-            "reached": state.reached,
-            "captured": state.captured,
+        carry, output = policy.apply_with(params, carry, env.observe(state), noise_t)
+        following, transition = env.step(state, output.action)
+        said = {
             "actions": output.action,
             "attention": output.attention,
-            "communication": output.communication if gate is None else gate,
+            "communication": output.communication,
             "reward": transition.reward,
-            "ended": transition.terminated | transition.truncated,
-            "success": transition.success,
         }
-        return (state, carry), record
+        ended = transition.terminated | transition.truncated
+        return (following, carry), (state, said, ended, transition.success)
 
-    _, steps = jax.lax.scan(step, (first, policy.initial_carry()), noise)
-    return first, steps
+    start = env.reset(reset_key), policy.initial_carry()
+    (last, _), (before, *steps) = jax.lax.scan(step, start, noise)
+    states = jax.tree.map(lambda x, end: jnp.concatenate([x, end[None]]), before, last)
+    return states, *steps
