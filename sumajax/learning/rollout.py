@@ -102,14 +102,20 @@ def act(
     noise: Any,
 ) -> tuple[Any, Any]:
     """The policy's step in all environments: (carry, PolicyOutput)."""
+    own = own_features(env, policy, params, features, actors.env_state)
     view = jax.vmap(env.view)(actors.env_state)
-    if features is None:
-        obs = jax.vmap(env.observe)(actors.env_state)
-        flat = obs.state.reshape(-1, *obs.state.shape[-3:])
-        mine = policy.encode_states(params, flat).reshape(*view.shape[:2], -1)
-    else:
-        mine = features[jax.vmap(env.state_index)(actors.env_state)]
-    return policy.step(params, actors.carry, mine, view, noise)
+    return policy.step(params, actors.carry, own, view, noise)
+
+
+def own_features(
+    env: Environment, policy: Policy, params: Any, features: chex.Array | None, env_state: Any
+) -> chex.Array:
+    """(E, N, F) features of what each agent is shown: from `state_features`, or encoded here."""
+    if features is not None:
+        return features[jax.vmap(env.state_index)(env_state)]
+    states = jax.vmap(env.observe)(env_state).state
+    flat = states.reshape(-1, *states.shape[-3:])
+    return policy.encode_states(params, flat).reshape(*states.shape[:-3], -1)
 
 
 def rollout(
@@ -195,15 +201,23 @@ def relive(
     cut = trajectory.last | (trajectory.steps_taken % gap == 0)  # (T, E): after the step
     begins = jnp.roll(cut, 1, axis=0).at[0].set(True)
     pieces = windows(begins, gap)
+    own = None
+    if features is None:  # too many states to list: all that were met, encoded as one batch
+        met = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), before.env_state)
+        own = own_features(env, policy, params, None, met)
+        own = own.reshape(*cut.shape, *own.shape[1:])
 
-    def body(carry: Any, now: tuple[chex.Array, Actors, Any]) -> tuple[Any, Any]:
-        begins, actors, noise = now
-        actors = replace(actors, carry=select(begins, actors.carry, carry))
-        carry, output = act(env, policy, params, features, actors, noise)
+    def body(carry: Any, now: tuple[chex.Array, Actors, Any, Any]) -> tuple[Any, Any]:
+        begins, actors, noise, own = now
+        carry = select(begins, actors.carry, carry)
+        if own is None:
+            own = own_features(env, policy, params, features, actors.env_state)
+        view = jax.vmap(env.view)(actors.env_state)
+        carry, output = policy.step(params, carry, own, view, noise)
         logits = {name: decision.logits for name, decision in output.decisions.items()}
         return carry, (logits, output.value)
 
-    steps = pieces.split((begins, before, noise))
+    steps = pieces.split((begins, before, noise, own))
     _, again = jax.lax.scan(body, policy.initial_carry(steps[0].shape[1:]), steps)
     logits, value = pieces.join(again)
     decisions = {
