@@ -59,12 +59,15 @@ def evaluate(
       key: the policy's own randomness; ignored when greedy.
       greedy: every choice of the policy (action, gate, edge, bit) is its likeliest one; may be
         traced, so both kinds share one compiled program.
+
+    Raises:
+      ValueError: when the policy was shaped for another task.
     """
+    policy.check_fits(env)
     features, params = state_features(env, policy, params), policy.prepare(params)
 
     def choose(actors: Actors, key: chex.PRNGKey) -> tuple[Any, chex.Array]:
-        noise = policy.sample_noise(key, actors.episode_return.shape[:1])
-        noise = jax.tree.map(lambda x: jnp.where(greedy, 0.0, x), noise)
+        noise = policy.sample_noise(key, actors.episode_return.shape[:1], greedy)
         carry, output = act(env, policy, params, features, actors, noise)
         return carry, output.action
 
@@ -182,14 +185,17 @@ class Agent:
     def act(
         self, carry: Any, obs: Observation, key: chex.PRNGKey, *, greedy: chex.Numeric = False
     ) -> tuple[Any, chex.Array]:
-        """(next carry, actions (..., N) int32) for obs.state (..., N, 1, rows, columns).
+        """(next carry, actions (..., N) int32) for obs.state (..., N, C, rows, columns).
 
         Args:
           key: ignored when greedy.
           greedy: take the likeliest choice everywhere; may be traced.
+
+        Raises:
+          ValueError: for the observation, or the carry, of another team or grid.
         """
-        noise = self.policy.sample_noise(key, obs.view.shape[:-4])
-        noise = jax.tree.map(lambda x: jnp.where(greedy, 0.0, x), noise)
+        self.policy.check_step(carry, obs)
+        noise = self.policy.sample_noise(key, obs.view.shape[:-4], greedy)
         carry, output = self.policy.apply_with(self.params, carry, obs, noise)
         return carry, output.action
 
@@ -223,7 +229,8 @@ def load_agent(
     like = jax.eval_shape(policy.init, key_of(0))
     seeds = meta.get("seeds", [])
     if seed is not None and seed not in (seeds or [0]):
-        raise CheckpointError(f"{root} holds seeds {seeds or [0]}, not {seed}.")
+        known = ", ".join(map(str, seeds or [0]))
+        raise CheckpointError(f"{root} has no seed {seed}; its seeds are {known}.")
     if seeds:
         place = 0 if seed is None else seeds.index(seed)
         stacked = jax.tree.map(

@@ -6,10 +6,11 @@ from typing import Any, Literal, get_args
 import chex
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from sumajax.environments.grid import grid_size, plain_size
-from sumajax.environments.types import Environment, Observation, Transition
+from sumajax.environments.states import SparseStates, listed_states
+from sumajax.environments.types import Observation
+from sumajax.environments.wrapper import Wrapper
 from sumajax.plain import plain_fields
 
 Scale = Literal["none", "mass"]
@@ -34,12 +35,12 @@ def upsample(state: chex.Array, factor: int | tuple[int, int]) -> chex.Array:
 
 
 @dataclass(frozen=True)
-class StateUpsampled:
+class StateUpsampled(Wrapper):
     """A task seen at another task's size: the SUMA-POMDP of paper section IV-B.
 
-    N, O, A, T, r and gamma are those of `env`; only the state tensor grows, from `env`'s grid to
-    `size`. With `scale="mass"` a block sums to what its cell held (1/f^2 each), otherwise, as in
-    the paper, each of its cells holds that value.
+    N, O, A, T, r and gamma are those of `env`, any task; only the state tensor grows, each of its
+    channels, from `env`'s grid to `size`. With `scale="mass"` a block sums to what its cell held
+    (1/f^2 each), otherwise, as in the paper, each of its cells holds that value.
 
     With `fill="corner"` nothing is upsampled: the small state stands as it is in the first rows and
     columns of the large one, zeros around it. It is the control that tells what upsampling adds to
@@ -49,7 +50,6 @@ class StateUpsampled:
       ValueError: when `size` is no size, or no whole multiple of the grid of `env`.
     """
 
-    env: Environment
     size: int | tuple[int, int]
     scale: Scale = "none"
     fill: Fill = "blocks"
@@ -78,65 +78,29 @@ class StateUpsampled:
         return rows // self.env.state_shape[1], columns // self.env.state_shape[2]
 
     @property
-    def max_steps(self) -> int:
-        return self.env.max_steps
-
-    @property
-    def num_agents(self) -> int:
-        return self.env.num_agents
-
-    @property
-    def num_actions(self) -> int:
-        return self.env.num_actions
-
-    @property
-    def agent_class(self) -> np.ndarray:
-        return self.env.agent_class
-
-    @property
-    def action_mask(self) -> np.ndarray:
-        return self.env.action_mask
-
-    @property
     def state_shape(self) -> tuple[int, int, int]:
-        return (1, *grid_size(self.size))
-
-    @property
-    def view_shape(self) -> tuple[int, int, int]:
-        return self.env.view_shape
-
-    @property
-    def sighted_classes(self) -> tuple[bool, ...]:
-        return self.env.sighted_classes
-
-    def reset(self, key: chex.PRNGKey) -> Any:
-        return self.env.reset(key)
-
-    def state_at(self, agents: ArrayLike, prey: ArrayLike) -> Any:
-        return self.env.state_at(agents, prey)  # type: ignore[attr-defined]
-
-    def step(self, state: Any, actions: chex.Array) -> tuple[Any, Transition]:
-        return self.env.step(state, actions)
+        return (self.env.state_shape[0], *grid_size(self.size))
 
     def observe(self, state: Any) -> Observation:
         seen = self.env.observe(state)
         return seen.replace(state=self._transform(seen.state))  # type: ignore[attr-defined]
 
-    def view(self, state: Any) -> chex.Array:
-        return self.env.view(state)
-
-    def state_index(self, state: Any) -> chex.Array:
-        return self.env.state_index(state)
-
     def state_table(self) -> chex.Array | None:
         table = self.env.state_table()
         return None if table is None else self._transform(table)
 
-    def active(self, state: Any) -> chex.Array:
-        return self.env.active(state)
-
-    def shortest_steps(self, state: Any) -> chex.Array:
-        return self.env.shortest_steps(state)  # type: ignore[attr-defined]
+    def sparse_states(self) -> SparseStates | None:
+        small = listed_states(self.env)
+        if small is None:
+            return None
+        channel, row, column = (place[..., None] for place in small.places())
+        _, rows, columns = self.state_shape
+        down, right = (1, 1) if self.fill == "corner" else self.factor
+        block = np.arange(down * right)
+        row, column = row * down + block // right, column * right + block % right
+        cell = ((channel * rows + row) * columns + column).astype(np.int32)
+        parts = down * right if self.scale == "mass" else 1
+        return small.moved(cell, parts, self.state_shape)
 
     def _transform(self, state: chex.Array) -> chex.Array:
         if self.fill == "corner":

@@ -15,6 +15,8 @@ def test_extending(capsys, tmp_path, monkeypatch):
         exec(compile(code, "extending.md", "exec"), shared)
     assert shared["metrics"].env_steps.tolist() == [20_000] * 10
     assert shared["result"].success.mean() > 0.9  # measured: 1.0, a random policy 0.12
+    calm, slower = (shared[name].steps_taken.mean() for name in ("result", "slower"))
+    assert calm < slower < 12  # measured: 3.2 and 3.6
     assert shared["metrics"].success[-1] > 0.9  # the memoryless policy's, in training: 1.0
     assert capsys.readouterr().out.count("steps taken") == 2
     assert shared["summary"]["transfer"]["env_steps"] == 40_000

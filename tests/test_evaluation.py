@@ -9,7 +9,7 @@ import pytest
 
 from sumajax import checkpoint, evaluation
 from sumajax.checkpoint import CheckpointError
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, Wrapper
 from sumajax.evaluation import (
     EPISODES,
     Agent,
@@ -19,7 +19,8 @@ from sumajax.evaluation import (
     load_agent,
     shortest_path_steps,
 )
-from sumajax.policies import make_policy
+from sumajax.policies import Policy, PolicyModule, PolicyOutput, TeamSpec, make_policy
+from sumajax.policies.types import decide
 from sumajax.upsampling import StateUpsampled
 
 PP = PredatorPrey(size=5, num_predators=3, vision=1, max_steps=80)
@@ -229,3 +230,86 @@ class TestLoadAgent:
         """A place in the list is no seed."""
         with pytest.raises(CheckpointError, match=r"has no seed 1; its seeds are 7, 8\."):
             load_agent(directory, seed=1)
+
+    def test_a_task_that_offers_none_offers_none_at_another_size(self):
+        class Plain(Wrapper):
+            """Predator-Prey's contract, and nothing beside it."""
+
+            def __getattr__(self, name):
+                raise AttributeError(name)
+
+        assert shortest_path_steps(StateUpsampled(Plain(TINY), 6), FEW) is None
+
+
+class WholeNumbers(PolicyModule):
+    """Draws its actions as whole numbers: 0 is stay, the likeliest."""
+
+    def encode_states(self, states):
+        return jnp.zeros((states.shape[0], 1))
+
+    def __call__(self, carry, state_features, view, noise):
+        likes = jax.nn.one_hot((4 + noise["turn"]) % self.team.num_actions, self.team.num_actions)
+        decisions = {"action": decide(likes, noise["gumbel"])}
+        silent = jnp.zeros(likes.shape[:-1])
+        pairs = jnp.zeros((*silent.shape, self.team.num_agents))
+        return carry, PolicyOutput(decisions, silent, silent, pairs)
+
+    def initial_carry(self, batch_shape):
+        return ()
+
+    def sample_noise(self, key, batch_shape):
+        shape = (*batch_shape, self.team.num_agents)
+        turn = jax.random.randint(key, shape, 0, self.team.num_actions)
+        return {"turn": turn, "gumbel": jnp.zeros((*shape, self.team.num_actions))}
+
+
+class TestNoiseOfAnyType:
+    policy = Policy("whole", WholeNumbers(TeamSpec.of(TINY)))
+
+    def test_evaluation(self):
+        """Greedy, everybody stays for ever; drawn, somebody arrives."""
+        for greedy in (True, False):
+            result = evaluate(TINY, self.policy, {}, jax.random.key(0), episodes=FEW, greedy=greedy)
+            assert (result.steps_taken == TINY.max_steps).all() == greedy
+
+    def test_acting(self):
+        agent = Agent(TINY, self.policy, {})
+        obs = TINY.observe(TINY.reset(jax.random.key(0)))
+        act = jax.jit(lambda key, greedy: agent.act((), obs, key, greedy=greedy)[1])
+        for greedy in (True, jnp.array(True)):
+            assert act(jax.random.key(0), greedy).tolist() == [4, 4]
+        drawn = [act(jax.random.key(seed), False).tolist() for seed in range(4)]
+        assert any(actions != [4, 4] for actions in drawn)
+
+
+class TestAnotherTask:
+    """A policy on a task it was not shaped for is refused in words, not by a failing product."""
+
+    @pytest.mark.parametrize(
+        ("env", "differs"),
+        [
+            (PredatorPrey(size=3, num_predators=3), r"agent_class \(0, 0\) against \(0, 0, 0\)"),
+            (PredatorPrey(size=4, num_predators=2), r"state_shape \(1, 3, 3\) against \(1, 4, 4\)"),
+            (StateUpsampled(TINY, 6), r"state_shape \(1, 3, 3\) against \(1, 6, 6\)"),
+            (TINY_PCP, r"num_actions 5 against 6"),
+        ],
+    )
+    def test_evaluation(self, env, differs):
+        policy, params = tiny_policy()
+        with pytest.raises(ValueError, match=f"made for another task: .*{differs}.*make_policy"):
+            evaluate(env, policy, params, jax.random.key(0), episodes=FEW)
+
+    @pytest.mark.parametrize("env", [PredatorPrey(size=3), PredatorPrey(size=4, num_predators=2)])
+    def test_acting(self, env):
+        agent = Agent(TINY, *tiny_policy())
+        obs = env.observe(env.reset(jax.random.key(0)))
+        with pytest.raises(ValueError, match=r"observation's state has shape .* made for .*; call"):
+            agent.act(agent.initial_carry(), obs, jax.random.key(0))
+
+    def test_acting_with_the_memory_of_another_team_or_batch(self):
+        agent = Agent(TINY, *tiny_policy())
+        obs = TINY.observe(TINY.reset(jax.random.key(0)))
+        other = make_policy("ic3net", PredatorPrey(size=3), hidden=4, encoder="linear")
+        for carry in (other.initial_carry(), agent.initial_carry((7,)), ()):
+            with pytest.raises(ValueError, match=r"the carry has shapes .*initial_carry\(\(\)\)"):
+                agent.act(carry, obs, jax.random.key(0))

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sumajax.environments import Environment, PredatorCapturePrey, PredatorPrey
+from sumajax.policies import make_policy
 from sumajax.upsampling import StateUpsampled, upsample
 
 factors = st.integers(1, 3)
@@ -73,6 +74,24 @@ TASKS = [
     PredatorPrey(size=(2, 3), num_predators=2),
     PredatorCapturePrey(size=5, num_predators=2, num_capturers=1),
 ]
+
+
+class TwoChannels(PredatorPrey):
+    """The own cell, and how far down and right it is."""
+
+    @property
+    def state_shape(self):
+        return (2, *self.shape)
+
+    def state_table(self):
+        cells = super().state_table()
+        return jnp.concatenate(
+            [cells, cells * jnp.arange(1.0, 1 + len(cells))[:, None, None, None]], 1
+        )
+
+    def observe(self, state):
+        seen = super().observe(state)
+        return seen.replace(state=self.state_table()[self.state_index(state)])
 
 
 def twice(env, **changes) -> StateUpsampled:
@@ -177,6 +196,37 @@ class TestStateUpsampled:
         sentence = "scale 'sum' is unknown; choose one of none, mass."
         with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
             StateUpsampled(PredatorPrey(size=5), size=10, scale="sum")
+
+    @pytest.mark.parametrize(("scale", "fill"), [("none", "blocks"), ("mass", "blocks"),
+                                                 ("none", "corner")])  # fmt: skip
+    def test_every_channel_is_kept(self, scale, fill):
+        """Also in two steps, and whatever becomes of the blocks."""
+        env = TwoChannels(size=(2, 3), num_predators=2)
+        state = jax.jit(env.reset)(jax.random.key(0))
+        suma = StateUpsampled(StateUpsampled(env, (2, 6), scale, fill), (4, 6), scale, fill)
+        assert suma.state_shape == (2, 4, 6)
+        seen, table = suma.observe(state).state, suma.state_table()
+        assert seen.shape == (2, 2, 4, 6)
+        assert table.shape == (6, 2, 4, 6)
+        np.testing.assert_array_equal(table[suma.state_index(state)], seen)
+        np.testing.assert_array_equal(suma.sparse_states().dense(), table)
+        for channel in range(2):
+            own = env.observe(state).state[:, channel : channel + 1]
+            whole = StateUpsampled(PredatorPrey(size=(2, 3)), (4, 6), scale, fill)._transform(own)
+            np.testing.assert_array_equal(seen[:, channel : channel + 1], whole)
+
+    @pytest.mark.parametrize("name", ["ic3net", "magic", "hetnet"])
+    def test_policies_read_every_channel(self, name):
+        env = StateUpsampled(TwoChannels(size=(2, 3), num_predators=2), (4, 6))
+        policy = make_policy(name, env)
+        assert policy.team.state_shape == (2, 4, 6)
+        states = env.sparse_states()
+        params = jax.jit(policy.init)(jax.random.key(0))
+        listed = jax.jit(lambda p: policy.encode_listed(p, states))(params)
+        direct = jax.jit(policy.encode_states)(params, jnp.asarray(states.dense()))
+        np.testing.assert_allclose(listed, direct, atol=1e-5)
+        without = jax.jit(policy.encode_states)(params, jnp.asarray(states.dense()).at[:, 1].set(0))
+        assert np.abs(direct - without).max(-1).min() > 1e-4
 
     def test_configurations_are_values(self):
         assert StateUpsampled(TASKS[0], size=10) == StateUpsampled(TASKS[0], size=10)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import numpy as np
 import tyro
 
@@ -27,10 +26,13 @@ from sumajax.cli.domains import (
     team_label,
     with_size,
 )
-from sumajax.cli.options import parse, plain_errors, prepare_jax
+from sumajax.cli.options import keep_compiled, parse, plain_errors
 from sumajax.environments.types import Environment
+from sumajax.environments.wrapper import unwrapped
 from sumajax.evaluation import EPISODES, Agent, load_agent, shortest_path_steps
 from sumajax.experiment.records import EVALUATION_SEED, held_out
+from sumajax.keys import key_of
+from sumajax.learning import parallel
 from sumajax.policies import Policy
 from sumajax.transfer import stage_directories
 from sumajax.upsampling import StateUpsampled
@@ -133,7 +135,7 @@ def _trained(directory: Path, arm: str | None, seeds: tuple[int, ...]) -> Traine
     seeds = seeds or saved
     agents = tuple(load_agent(directory, seed=seed) for seed in seeds)
     env: Any = agents[0].env
-    task = getattr(env, "env", env)
+    task: Any = unwrapped(env)
     name = arm or str(meta.get("arm", directory.name))
     return Trained(name, meta, task, env.state_shape[1:], seeds, agents)
 
@@ -267,7 +269,7 @@ def _write_replay(config: EvaluateConfig, trained: Trained, task: Any) -> None:
         env,
         policy,
         trained.agents[0].params,
-        jax.random.key(EVALUATION_SEED),
+        key_of(EVALUATION_SEED),
         greedy="sampled" not in config.modes,
     )
     assert config.replay is not None
@@ -280,5 +282,6 @@ def main(arguments: list[str] | None = None) -> None:
     with plain_errors("stopped; no file was written."):
         prog = None if arguments is None else "sumajax evaluate"
         config = parse(EvaluateConfig, EvaluateConfig(path=tyro.MISSING), arguments, prog=prog)
-        prepare_jax(1)
+        keep_compiled()
+        parallel.choose_devices(1, 1, 1)
         run_evaluation(config)

@@ -14,8 +14,6 @@ from typing import Any, TypeVar, get_type_hints
 import jax
 import tyro
 
-from sumajax.learning import parallel
-
 Options = TypeVar("Options")
 GOES_ON = "stopped; the same command goes on from the last checkpoint."
 CACHE = Path(".cache") / "sumajax" / "compiled"
@@ -42,9 +40,8 @@ def plain_errors(stopped: str = GOES_ON) -> Iterator[None]:
         raise SystemExit(130) from None
 
 
-def prepare_jax(devices: int) -> None:
-    """One CPU device per core, and compiled programs kept for the next time."""
-    parallel.use_cpu_devices(devices)
+def keep_compiled() -> None:
+    """Keeps compiled programs for the next time; says so where that cannot be."""
     if os.environ.get("SUMAJAX_NO_CACHE") or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     try:

@@ -1,6 +1,5 @@
 """`sumajax transfer DOMAIN`: its options, the plan that they say, and its run."""
 
-import os
 import sys
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
@@ -20,7 +19,7 @@ from sumajax.cli.domains import (
     team_label,
     with_size,
 )
-from sumajax.cli.options import chosen_preset, parse, plain_errors, prepare_jax
+from sumajax.cli.options import chosen_preset, keep_compiled, parse, plain_errors
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES
@@ -104,8 +103,8 @@ class TransferOptions:
     checkpoint_every: int = CHUNK
     """Epochs between two checkpoints at most."""
     devices: int | None = None
-    """CPU devices to spread seeds and environments over, of each host; None: all that they spread
-    over."""
+    """Devices to spread seeds and environments over, of each host; None: all there are that can
+    share them, of CPUs one per core."""
     hosts: int = 1
     """How many machines (or processes) train together, each started with the same command and its
     own --host."""
@@ -126,12 +125,12 @@ class TransferOptions:
             ("checkpoint_every", 1, MAX_EPOCHS),
             ("hosts", 1, MAX_HOSTS),
             ("host", 0, self.hosts - 1),
-            ("num_devices", 1, MAX_DEVICES),
+            ("devices", 1, MAX_DEVICES),
         ):
-            if not least <= getattr(self, name) <= most:
+            value = getattr(self, name)
+            if value is not None and not least <= value <= most:
                 raise ValueError(
-                    f"{name.removeprefix('num_').replace('_', '-')} must lie between {least} and "
-                    f"{most}, got {getattr(self, name)}."
+                    f"{name.replace('_', '-')} must lie between {least} and {most}, got {value}."
                 )
         check_seeds(self.seeds)
         if not 0 < self.threshold < float("inf"):
@@ -148,15 +147,8 @@ class TransferOptions:
             )
         if self.coordinator is not None:
             hosts.address(self.coordinator)
-        parallel.spread(len(self.seeds), self.learner.num_envs, self.hosts * self.num_devices)
-
-    @property
-    def num_devices(self) -> int:
-        """Of this host: those asked for, or as many as seeds and environments spread over."""
         if self.devices is not None:
-            return self.devices
-        most = min(os.cpu_count() or 1, MAX_DEVICES)
-        return parallel.most_devices(len(self.seeds), self.learner.num_envs, most, self.hosts)
+            parallel.spread(len(self.seeds), self.learner.num_envs, self.hosts * self.devices)
 
     @property
     def directory(self) -> Path:
@@ -208,7 +200,7 @@ class TransferOptions:
 
     def where(self) -> Where:
         return Where(
-            devices=self.num_devices,
+            devices=self.devices,
             num_hosts=self.hosts,
             log=self.log,
             chunk=self.checkpoint_every,
@@ -263,7 +255,7 @@ def main(domain: str, arguments: list[str] | None = None) -> None:
         )
         prog = None if arguments is None else f"sumajax transfer {domain}"
         config = parse(options, default, given, NOTE, prog=prog)
-        prepare_jax(config.num_devices)
+        keep_compiled()
         if config.coordinator is not None:
             hosts.connect(config.hosts, config.host, config.coordinator)
         summary = run_experiment(config.experiment(), config.directory, config.where())
@@ -282,7 +274,7 @@ def settings_of(policy: str) -> dict[str, Any]:
 
 def described(options: TransferOptions) -> dict[str, Any]:
     """The options as config.json keeps them, without those of one host's place in the run."""
-    values = {**asdict(options), "devices": options.num_devices}
+    values = asdict(options)
     if options.source_checkpoint is not None:
         values["source_checkpoint"] = options.source_checkpoint.absolute()
     return plain({k: v for k, v in values.items() if k not in ("hosts", "host", "coordinator")})

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from sumajax.environments.types import Environment, Observation
+from sumajax.environments.wrapper import unwrapped
 
 if importlib.util.find_spec("gymnax") is not None:
     from gymnax.environments import spaces
@@ -39,14 +40,19 @@ class AutoReset:
 
     Observations are `Observation` records, actions (N,) int32 and rewards (N,) float32: one
     environment of a whole team. All functions can be traced and vmapped.
+
+    Attributes:
+      team_reward: one reward () for the team, the mean over its agents, as programs and wrappers
+        for a single agent add up (gymnax's `LogWrapper`).
     """
 
     env: Environment
+    team_reward: bool = False
 
     @property
     def name(self) -> str:
         """The task's class."""
-        return type(self.env).__name__
+        return type(unwrapped(self.env)).__name__
 
     @property
     def num_agents(self) -> int:
@@ -79,16 +85,19 @@ class AutoReset:
           action: (N,) int32, or N numbers.
 
         Returns:
-          observation and state (those of the next episode after an end), reward (N,), terminated
-          () bool, truncated () bool, and info: `final_observation`, what the team saw before any
-          reset (meant for the value after an end), `terminated`, `truncated`, `success`,
-          `steps_taken`. The two flags are never both true: a team that is done with its last step
-          has terminated.
+          observation and state (those of the next episode after an end), reward (N,), or () with
+          `team_reward`, terminated () bool, truncated () bool, and info: `final_observation`, what
+          the team saw before any reset (meant for the value after an end), `terminated`,
+          `truncated`, `success`, `steps_taken`. The two flags are never both true: a team that is
+          done with its last step has terminated.
         """
-        # The dynamics draw nothing; all of the key is the next episode's.
+        # As gymnax splits it: a step's half, unused since domains keep a key of their own in their
+        # state, and the next episode's.
+        _, reset_key = jax.random.split(key)
         stepped, transition = self.env.step(state, jnp.asarray(action))
         seen = self.env.observe(stepped)
-        fresh_seen, fresh = self.reset(key)
+        fresh_seen, fresh = self.reset(reset_key)
+        reward = transition.reward.mean() if self.team_reward else transition.reward
         done = transition.terminated | transition.truncated
         obs, state = jax.tree.map(
             lambda a, b: jnp.where(done, a, b), (fresh_seen, fresh), (seen, stepped)
@@ -100,7 +109,7 @@ class AutoReset:
             "success": transition.success,
             "steps_taken": transition.steps_taken,
         }
-        return obs, state, transition.reward, transition.terminated, transition.truncated, info
+        return obs, state, reward, transition.terminated, transition.truncated, info
 
     def observe(
         self,

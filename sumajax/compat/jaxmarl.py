@@ -22,6 +22,7 @@ from flax import struct
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.environments.types import Environment
+from sumajax.environments.wrapper import unwrapped
 from sumajax.records import exportable
 from sumajax.upsampling import StateUpsampled
 
@@ -79,7 +80,17 @@ class JaxMARLEnv(Base):
     @property
     def name(self) -> str:
         """The task's class."""
-        return type(getattr(self.task, "env", self.task)).__name__
+        return type(unwrapped(self.task)).__name__
+
+    def __eq__(self, other: object) -> bool:
+        """Of the same task: two such share what is compiled."""
+        return isinstance(other, JaxMARLEnv) and (type(self), self.task) == (
+            type(other),
+            other.task,
+        )
+
+    def __hash__(self) -> int:
+        return hash((type(self), self.task))
 
     @property
     def agent_classes(self) -> dict[str, list[str]]:
@@ -131,11 +142,13 @@ class JaxMARLEnv(Base):
           observations, state, rewards () and dones () by agent, `__all__` among the dones, and
           info, whose leaves are (num_agents,): `success`, `terminated`, `truncated`, `steps_taken`.
         """
-        # The dynamics draw nothing; all of the key is the next episode's.
-        obs, stepped, rewards, dones, info = self.step_env(key, state, actions)
-        fresh_obs, fresh = (
-            self.reset(key) if reset_state is None else (self.get_obs(reset_state), reset_state)
-        )
+        # As JaxMARL splits it: the step's half, and the next episode's.
+        step_key, reset_key = jax.random.split(key)
+        obs, stepped, rewards, dones, info = self.step_env(step_key, state, actions)
+        if reset_state is None:
+            fresh_obs, fresh = self.reset(reset_key)
+        else:
+            fresh_obs, fresh = self.get_obs(reset_state), reset_state
         obs, stepped = jax.tree.map(
             lambda a, b: jnp.where(dones["__all__"], a, b), (fresh_obs, fresh), (obs, stepped)
         )
@@ -144,7 +157,8 @@ class JaxMARLEnv(Base):
     def step_env(
         self, key: chex.PRNGKey, state: State, actions: dict[str, chex.Array]
     ) -> tuple[Any, State, dict[str, chex.Array], dict[str, chex.Array], dict[str, chex.Array]]:
-        """`step` without the reset; the key is not used."""
+        """`step` without the reset; the key is not used, as a domain whose steps need one keeps it
+        in its state."""
         joint = jnp.stack([jnp.reshape(actions[agent], ()) for agent in self.agents])
         env_state, transition = self.task.step(state.env_state, joint.astype(jnp.int32))
         done = transition.terminated | transition.truncated

@@ -2,6 +2,18 @@
 
 from sumajax.environments.predator_capture_prey import PredatorCapturePrey
 from sumajax.environments.predator_prey import PredatorPrey
+from sumajax.environments.states import SparseStates
 from sumajax.environments.types import Environment, Observation, Transition
+from sumajax.environments.wrapper import Wrapper, rewrapped, unwrapped
 
-__all__ = ["Environment", "Observation", "PredatorCapturePrey", "PredatorPrey", "Transition"]
+__all__ = [
+    "Environment",
+    "Observation",
+    "PredatorCapturePrey",
+    "PredatorPrey",
+    "SparseStates",
+    "Transition",
+    "Wrapper",
+    "rewrapped",
+    "unwrapped",
+]

@@ -20,6 +20,7 @@ from flax import struct
 from jax.typing import ArrayLike
 
 from sumajax.environments import grid
+from sumajax.environments.states import SparseStates, one_hot_states
 from sumajax.environments.types import Observation, Transition
 from sumajax.plain import plain_fields
 from sumajax.records import exportable
@@ -142,6 +143,9 @@ class PredatorCapturePrey:
     def state_table(self) -> chex.Array:
         return grid.one_hot_cells(self.shape)
 
+    def sparse_states(self) -> SparseStates:
+        return one_hot_states(self.shape)
+
     def active(self, state: State) -> chex.Array:
         return active(self, state)
 
@@ -208,7 +212,7 @@ def step(env: PredatorCapturePrey, state: State, actions: chex.Array) -> tuple[S
     transition = Transition(
         reward=_reward(env, on_prey, captured),
         terminated=terminated,
-        truncated=(time == env.max_steps) & ~terminated,
+        truncated=(time >= env.max_steps) & ~terminated,
         success=success,
         steps_taken=time,
     )

@@ -14,10 +14,11 @@ from sumajax.records import exportable
 class Observation:
     """What the agents know before they act (paper section IV-A, IV-C).
 
-    Axes: N agents, (rows, columns) of the policy's grid, c entity channels, m = 2 vision + 1.
+    Axes: N agents, C state channels (1 where the state is the agent's cell), (rows, columns) of the
+    policy's grid, c entity channels, m = 2 vision + 1.
     """
 
-    state: chex.Array  # (N, 1, rows, columns) float32: the agent's own cell, one-hot (or upsampled)
+    state: chex.Array  # (N, C, rows, columns) float32: the agent's own cell, one-hot (or upsampled)
     view: chex.Array  # (N, c, m, m) float32: entity counts around the agent, -1 outside the grid
 
 
@@ -28,7 +29,7 @@ class Transition:
 
     reward: chex.Array  # (N,) float32: individual rewards of this step
     terminated: chex.Array  # () bool: the team is done
-    truncated: chex.Array  # () bool: the step limit was hit without being done
+    truncated: chex.Array  # () bool: not done, and the step limit is reached or passed
     success: chex.Array  # () bool: the completion condition holds after this step, in every mode
     steps_taken: chex.Array  # () int32: steps of this episode so far, this one included
 
@@ -39,6 +40,13 @@ class Environment(Protocol):
 
     No function keeps state, resets on its own or needs a key after `reset`: all of them can be
     traced, vmapped and scanned. Policies read shapes and classes; the learner reads the rest.
+
+    A domain with chance in its steps takes a part of the key of `reset` into its state and splits
+    it anew in every `step`: environments side by side, steps and episodes then all draw apart.
+
+    Optional functions, used where a domain has them: `shortest_steps(state)`, () int32, the fewest
+    steps that the team could still need; `sparse_states()`, the `states.SparseStates` that
+    `state_table` lists, for large grids, whose table grows with the square of the cells.
     """
 
     @property
@@ -63,7 +71,7 @@ class Environment(Protocol):
 
     @property
     def state_shape(self) -> tuple[int, int, int]:
-        """(1, rows, columns) of `Observation.state`."""
+        """(C, rows, columns) of `Observation.state`."""
 
     @property
     def view_shape(self) -> tuple[int, int, int]:
@@ -77,7 +85,11 @@ class Environment(Protocol):
         """A fresh episode."""
 
     def step(self, state: Any, actions: chex.Array) -> tuple[Any, Transition]:
-        """One step of the whole team; `actions` is (N,) int32."""
+        """One step of the whole team; `actions` is (N,) int32.
+
+        `truncated` is true at the step limit and past it, while the team is not done: a caller that
+        steps on, or comes with a state of a longer limit, is told at every step.
+        """
 
     def observe(self, state: Any) -> Observation:
         """What the agents see now; equals `state_table()[state_index(state)]` and `view(state)`."""
@@ -89,7 +101,7 @@ class Environment(Protocol):
         """(N,) int32: the row of `state_table()` that is each agent's state tensor."""
 
     def state_table(self) -> chex.Array | None:
-        """(S, 1, rows, columns): every state tensor that can occur, so each is encoded once; None
+        """(S, C, rows, columns): every state tensor that can occur, so each is encoded once; None
         where there are too many to list."""
 
     def active(self, state: Any) -> chex.Array:

@@ -13,6 +13,7 @@ import numpy as np
 from sumajax import reporting
 from sumajax.environments.types import Environment
 from sumajax.evaluation import evaluate, evaluate_random, shortest_path_steps
+from sumajax.keys import key_of
 from sumajax.policies import Policy
 from sumajax.reporting.metrics import evaluation_summary
 
@@ -33,7 +34,7 @@ def held_out(
     env: Environment, policy: Policy, params: Sequence[Any], episodes: int, mode: str
 ) -> dict[str, Any]:
     """Means over the held-out starts, one per entry of `params` (the EVAL of summary.json)."""
-    key = jax.random.key(EVALUATION_SEED)
+    key = key_of(EVALUATION_SEED)
     results = [
         evaluate(env, policy, one, key, episodes=episodes, greedy=mode == "greedy")
         for one in params
@@ -58,7 +59,7 @@ def by_seed(params: Any) -> list[Any]:
 
 def references(env: Environment, policy: Policy, episodes: int) -> dict[str, Any]:
     """A random team, and the shortest paths, on the held-out starts of a task."""
-    random = evaluate_random(env, policy, jax.random.key(EVALUATION_SEED), episodes=episodes)
+    random = evaluate_random(env, policy, key_of(EVALUATION_SEED), episodes=episodes)
     bound = shortest_path_steps(env, episodes)
     return {
         "random_steps_taken": float(random.steps_taken.mean()),

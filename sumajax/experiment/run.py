@@ -19,6 +19,7 @@ from sumajax.experiment.interrupt import stop_when_asked
 from sumajax.experiment.plan import Experiment, Stage, described
 from sumajax.experiment.records import MODES, StageRecords, by_seed, held_out, references
 from sumajax.experiment.summary import stage_labels, summarise, table
+from sumajax.keys import key_of
 from sumajax.learning import EPOCH_STEPS, TrainState, make_learner, parallel
 from sumajax.policies import Policy
 from sumajax.reporting import metrics as metrics_file
@@ -43,14 +44,14 @@ class Where:
     """Where a run is computed and shown; no part of what it is, and free to change on resuming.
 
     Attributes:
-      devices: of each host, to spread seeds and environments over.
+      devices: of each host, to spread seeds and environments over; None: all that can share them.
       num_hosts: processes that train as one, see `sumajax.hosts`.
       log: where to show the metrics beside metrics.csv.
       chunk: epochs between two checkpoints.
       options: the command line's, kept in config.json for `--config`.
     """
 
-    devices: int = 1
+    devices: int | None = None
     num_hosts: int = 1
     log: Sequence[str] = ()
     chunk: int = CHUNK
@@ -99,8 +100,9 @@ class Run:
         saved_parts(self.stage_run(stage), self.start(stage), carry_optimiser=stage.carry_optimiser)
 
     def mesh(self, stage: Stage) -> Mesh:
-        devices = self.where.num_hosts * self.where.devices
-        return parallel.make_mesh(len(self.experiment.seeds), stage.learner.num_envs, devices)
+        seeds, envs, where = len(self.experiment.seeds), stage.learner.num_envs, self.where
+        of_each = parallel.choose_devices(seeds, envs, where.devices, where.num_hosts)
+        return parallel.make_mesh(seeds, envs, where.num_hosts * of_each)
 
     def checkpoints(self, stage: Stage) -> Path:
         return self.directory / "checkpoints" / stage.name
@@ -286,7 +288,7 @@ class Recorder:
                 stage.env,
                 policy,
                 jax.tree.map(lambda x: x[0], params),
-                jax.random.key(records.EVALUATION_SEED),
+                key_of(records.EVALUATION_SEED),
                 greedy=True,
             )
         except ValueError as error:  # a domain without anything to draw

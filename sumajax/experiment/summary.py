@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from sumajax.environments.types import Environment
+from sumajax.environments.wrapper import unwrapped
 from sumajax.experiment.plan import Experiment, Stage, described
 from sumajax.experiment.records import MODES, StageRecords
 from sumajax.reporting import metrics as metrics_file
@@ -91,8 +92,7 @@ def stage_labels(experiment: Experiment) -> dict[str, str]:
 
 def grid_label(env: Environment) -> str:
     """The task's own grid, as 10x10."""
-    task = getattr(env, "env", env)
-    return "x".join(map(str, task.state_shape[-2:]))
+    return "x".join(map(str, unwrapped(env).state_shape[-2:]))
 
 
 def table(experiment: Experiment, summary: Mapping[str, Any], records: StageRecords) -> list[Any]:

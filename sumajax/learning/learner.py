@@ -336,15 +336,5 @@ def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None 
     Raises:
       ValueError: when the policy was shaped for another task.
     """
-    spec = type(policy.team).of(env)
-    if policy.team != spec:
-        differ = [
-            f"{name} {getattr(policy.team, name)} against {getattr(spec, name)}"
-            for name in spec.__dataclass_fields__
-            if getattr(policy.team, name) != getattr(spec, name)
-        ]
-        raise ValueError(
-            f"the policy was made for another task: {'; '.join(differ)}; call make_policy with "
-            "this environment (parameters of the same sizes still fit)."
-        )
+    policy.check_fits(env)
     return Learner(env, policy, config or LearnerConfig())

@@ -173,7 +173,7 @@ def _cpu_may_compute() -> bool:
 
 def _platforms() -> str:
     """What JAX was told to use, by the environment or by the program."""
-    return jax.config.read("jax_platforms") or ""
+    return jax.config.jax_platforms or ""  # type: ignore[attr-defined]
 
 
 def spread(num_seeds: int, num_envs: int, devices: int) -> tuple[int, int]:

@@ -6,9 +6,9 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
+from sumajax.environments.states import listed_states
 from sumajax.environments.types import Environment
 from sumajax.learning.windows import windows
 from sumajax.policies.types import Decision, Policy
@@ -90,10 +90,9 @@ def select(condition: chex.Array, if_true: Any, if_false: Any) -> Any:
 
 def state_features(env: Environment, policy: Policy, params: Any) -> chex.Array | None:
     """(S, F) features of every state tensor the task has, or None where it has too many to list."""
-    with jax.ensure_compile_time_eval():  # an encoder can make use of what is in it
-        table = env.state_table()
-        known = None if table is None else np.asarray(table)
-    return None if known is None else policy.encode_states(params, known)
+    with jax.ensure_compile_time_eval():  # an encoder can make use of what is in them
+        states = listed_states(env)
+    return None if states is None else policy.encode_listed(params, states)
 
 
 def act(
@@ -105,14 +104,20 @@ def act(
     noise: Any,
 ) -> tuple[Any, Any]:
     """The policy's step in all environments: (carry, PolicyOutput)."""
+    own = own_features(env, policy, params, features, actors.env_state)
     view = jax.vmap(env.view)(actors.env_state)
-    if features is None:
-        obs = jax.vmap(env.observe)(actors.env_state)
-        flat = obs.state.reshape(-1, *obs.state.shape[-3:])
-        mine = policy.encode_states(params, flat).reshape(*view.shape[:2], -1)
-    else:
-        mine = features[jax.vmap(env.state_index)(actors.env_state)]
-    return policy.step(params, actors.carry, mine, view, noise)
+    return policy.step(params, actors.carry, own, view, noise)
+
+
+def own_features(
+    env: Environment, policy: Policy, params: Any, features: chex.Array | None, env_state: Any
+) -> chex.Array:
+    """(E, N, F) features of what each agent is shown: from `state_features`, or encoded here."""
+    if features is not None:
+        return features[jax.vmap(env.state_index)(env_state)]
+    states = jax.vmap(env.observe)(env_state).state
+    flat = states.reshape(-1, *states.shape[-3:])
+    return policy.encode_states(params, flat).reshape(*states.shape[:-3], -1)
 
 
 def rollout(
@@ -204,15 +209,23 @@ def relive(
     cut = trajectory.last | (trajectory.steps_taken % gap == 0)  # (T, E): after the step
     begins = jnp.roll(cut, 1, axis=0).at[0].set(True)
     pieces = windows(begins, gap)
+    own = None
+    if features is None:  # too many states to list: all that were met, encoded as one batch
+        met = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), before.env_state)
+        own = own_features(env, policy, params, None, met)
+        own = own.reshape(*cut.shape, *own.shape[1:])
 
-    def body(carry: Any, now: tuple[chex.Array, Actors, Any]) -> tuple[Any, Any]:
-        begins, actors, noise = now
-        actors = replace(actors, carry=select(begins, actors.carry, carry))
-        carry, output = act(env, policy, params, features, actors, noise)
+    def body(carry: Any, now: tuple[chex.Array, Actors, Any, Any]) -> tuple[Any, Any]:
+        begins, actors, noise, own = now
+        carry = select(begins, actors.carry, carry)
+        if own is None:
+            own = own_features(env, policy, params, features, actors.env_state)
+        view = jax.vmap(env.view)(actors.env_state)
+        carry, output = policy.step(params, carry, own, view, noise)
         logits = {name: decision.logits for name, decision in output.decisions.items()}
         return carry, (logits, output.value)
 
-    steps = pieces.split((begins, before, noise))
+    steps = pieces.split((begins, before, noise, own))
     beginning = policy.initial_carry(steps[0].shape[1:])
     _, again = jax.lax.scan(body, beginning, steps, unroll=unroll)
     logits, value = pieces.join(again)
@@ -227,10 +240,7 @@ def last_value(env: Environment, policy: Policy, params: Any, actors: Actors) ->
     """(E, N) value of what the agents see now: the bootstrap after a rollout. No gradient."""
     params, actors = jax.lax.stop_gradient((params, actors))
     num_envs = actors.episode_return.shape[0]
-    # Zero noise: where messages depend on a draw (edges, bits), those of the likeliest draw.
-    noise = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype),
-        jax.eval_shape(lambda: policy.sample_noise(jax.random.key(0), (num_envs,))),
-    )
+    # Where messages depend on a draw (edges, bits), those of the likeliest draw.
+    noise = policy.greedy_noise((num_envs,))
     features = state_features(env, policy, params)
     return act(env, policy, params, features, actors, noise)[1].value

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
+from sumajax.environments.states import SparseStates
 from sumajax.policies.layers import Dense, lift
 from sumajax.policies.lit_places import lit_places, sum_by_state
 
@@ -77,10 +78,10 @@ class Conv(nn.Module):
 
 
 class StateEncoder(nn.Module):
-    """(S, 1, rows, columns) state tensors -> (S, 128).
+    """(S, C, rows, columns) state tensors -> (S, 128).
 
-    A NumPy array is known when the program is compiled: `flat` then computes only what differs from
-    an empty grid (`lit_places`), the same to rounding.
+    Sparse states and NumPy arrays are known when the program is compiled: `flat` then computes only
+    what differs from an empty grid (`lit_places`), the same to rounding.
     """
 
     kind: EncoderKind = "flat"
@@ -97,9 +98,13 @@ class StateEncoder(nn.Module):
         else:
             self.dense = Dense(STATE_FEATURES, fan_in=reached, before_relu=True)
 
-    def __call__(self, states: chex.Array) -> chex.Array:
+    def __call__(self, states: chex.Array | SparseStates) -> chex.Array:
         if self.kind == "flat" and isinstance(states, np.ndarray):
-            return nn.relu(self._known(np.moveaxis(states, -3, -1)))
+            states = SparseStates.of(states)
+        if self.kind == "flat" and isinstance(states, SparseStates):
+            return nn.relu(self._known(states))
+        if isinstance(states, SparseStates):
+            states = states.dense()
         x = jnp.moveaxis(states, -3, -1)
         if self.kind != "linear":
             x = self._convolved(x)
@@ -110,10 +115,11 @@ class StateEncoder(nn.Module):
     def _convolved(self, x: chex.Array) -> chex.Array:
         return nn.relu(self.conv2(nn.relu(self.conv1(x))))
 
-    def _known(self, states: np.ndarray) -> chex.Array:
-        """`dense` of the convolutions of states (S, rows, columns, 1), by the places they light."""
+    def _known(self, states: SparseStates) -> chex.Array:
+        """`dense` of the convolutions of the states, by the places they light."""
         places = lit_places(states, self.conv1.patches, self.conv2.patches)
-        empty = self._convolved(jnp.zeros((1, *states.shape[1:]), states.dtype))
+        channels, rows, columns = states.shape
+        empty = self._convolved(jnp.zeros((1, rows, columns, channels), jnp.float32))
         inner = nn.relu(self.conv1.dense(places.seen))
         inner = inner * places.exists[:, None, :, None].astype(inner.dtype)
         lit = nn.relu(self.conv2.dense(inner.reshape(*places.state.shape, -1)))  # (P, M, channels)
@@ -152,8 +158,8 @@ class ObservationEncoder(nn.Module):
         self.merge_state = Dense(self.features, fan_in=fan_in)
         self.merge_view = Dense(self.features, use_bias=False, fan_in=fan_in)
 
-    def encode_states(self, states: chex.Array) -> chex.Array:
-        """(S, 1, rows, columns) -> (S, features)."""
+    def encode_states(self, states: chex.Array | SparseStates) -> chex.Array:
+        """(S, C, rows, columns) -> (S, features)."""
         return self.merge_state(self.state_encoder(states))
 
     def __call__(

@@ -15,6 +15,7 @@ from flax import linen as nn
 from flax import struct
 from jax.nn.initializers import normal
 
+from sumajax.environments.states import SparseStates
 from sumajax.policies.attention import relation_attention, seen_through
 from sumajax.policies.encoder import (
     STATE_FEATURES,
@@ -399,8 +400,11 @@ class HetNet(PolicyModule):
         self.view_encoder = ViewEncoder()
         self.core = HetNetCore(bits=self.bits)
 
-    def encode_states(self, states: chex.Array) -> chex.Array:
+    def encode_states(self, states: chex.Array | SparseStates) -> chex.Array:
         return self.core.project_states(self.state_encoder(states))
+
+    def encode_listed(self, states: SparseStates) -> chex.Array:
+        return self.encode_states(states)
 
     def fold(self) -> dict[str, Any]:
         layers = self.core.graph.fold(self.team.class_size(0), self.team.class_size(1))

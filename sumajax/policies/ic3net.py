@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
+from sumajax.environments.states import SparseStates
 from sumajax.policies.encoder import EncoderKind, ObservationEncoder
 from sumajax.policies.layers import Dense, LSTMCell, lift, side_by_side
 from sumajax.policies.types import Decision, PolicyModule, PolicyOutput, decide, mask_actions
@@ -89,8 +90,11 @@ class IC3Net(PolicyModule):
             self.hidden, self.team.num_actions, self.communicates, self.gated, self.comm_passes
         )
 
-    def encode_states(self, states: chex.Array) -> chex.Array:
+    def encode_states(self, states: chex.Array | SparseStates) -> chex.Array:
         return self.observation.encode_states(states)
+
+    def encode_listed(self, states: SparseStates) -> chex.Array:
+        return self.encode_states(states)
 
     def __call__(
         self, carry: IC3NetCarry, state_features: chex.Array, view: chex.Array, noise: Any
@@ -110,7 +114,7 @@ class IC3Net(PolicyModule):
         output = PolicyOutput(
             decisions=decisions,
             value=value,
-            communication=gate,
+            communication=talked,
             attention=pairs / max(num_agents - 1, 1),
         )
         return IC3NetCarry(h, s, gate), output

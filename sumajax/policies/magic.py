@@ -13,6 +13,7 @@ from flax import linen as nn
 from flax import struct
 from jax.scipy.linalg import block_diag
 
+from sumajax.environments.states import SparseStates
 from sumajax.policies.attention import GraphAttention
 from sumajax.policies.encoder import EncoderKind, ObservationEncoder
 from sumajax.policies.layers import (
@@ -174,8 +175,11 @@ class MAGIC(PolicyModule):
         self.observation = ObservationEncoder(self.hidden, self.encoder)
         self.core = MAGICCore(self.hidden, self.team.num_actions, **SETTINGS[self.setting])
 
-    def encode_states(self, states: chex.Array) -> chex.Array:
+    def encode_states(self, states: chex.Array | SparseStates) -> chex.Array:
         return self.core.project_input(self.observation.encode_states(states))
+
+    def encode_listed(self, states: SparseStates) -> chex.Array:
+        return self.encode_states(states)
 
     def fold(self) -> dict[str, Any]:
         return self.core.fold(self.observation.view_kernel())

@@ -6,7 +6,7 @@ the agents of a class and none depends on how many there are: the same parameter
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, cast
 
 import chex
@@ -16,6 +16,7 @@ import numpy as np
 from flax import linen as nn
 from flax import struct
 
+from sumajax.environments.states import SparseStates, goes_with
 from sumajax.environments.types import Environment, Observation
 from sumajax.policies.layers import lift
 from sumajax.precision import stated_precision
@@ -67,7 +68,7 @@ class TeamSpec:
     sighted_classes: tuple[bool, ...]  # per class
     num_actions: int
     action_mask: tuple[tuple[bool, ...], ...]  # (N, num_actions)
-    state_shape: tuple[int, int, int]  # (1, rows, columns)
+    state_shape: tuple[int, int, int]  # (C, rows, columns)
     view_shape: tuple[int, int, int]  # (c, m, m)
 
     @classmethod
@@ -101,7 +102,12 @@ class PolicyModule(nn.Module, ABC):
 
     @abstractmethod
     def encode_states(self, states: chex.Array) -> chex.Array:
-        """(S, 1, rows, columns) state tensors -> (S, F) features, whatever `__call__` expects."""
+        """(S, C, rows, columns) state tensors -> (S, F) features, whatever `__call__` expects.
+
+        A module that defines `encode_listed(states)` beside it is given the `SparseStates` that a
+        task lists as they are, and others what they stand for: of a large grid, the square of its
+        cells.
+        """
 
     def fold(self) -> dict[str, Any]:
         """Products of weights that every step needs and that are the same at each, if any."""
@@ -162,10 +168,12 @@ class Policy:
             state=jnp.zeros((team.num_agents, *team.state_shape), jnp.float32),
             view=jnp.zeros((team.num_agents, *team.view_shape), jnp.float32),
         )
-        draws = jax.eval_shape(lambda: self.sample_noise(key, ()))  # the key is for `init` alone
-        noise = jax.tree.map(lambda draw: jnp.zeros(draw.shape, draw.dtype), draws)
         return self.module.init(
-            key, self.initial_carry(), obs, noise, method=self.module.encode_and_step
+            key,
+            self.initial_carry(),
+            obs,
+            self.greedy_noise(),
+            method=self.module.encode_and_step,
         )
 
     def initial_carry(self, batch_shape: tuple[int, ...] = ()) -> Any:
@@ -175,7 +183,7 @@ class Policy:
     def apply(
         self, params: Any, carry: Any, obs: Observation, key: chex.PRNGKey
     ) -> tuple[Any, PolicyOutput]:
-        """One team step: obs.state (..., N, 1, rows, columns), obs.view (..., N, c, m, m)."""
+        """One team step: obs.state (..., N, C, rows, columns), obs.view (..., N, c, m, m)."""
         return self.apply_with(params, carry, obs, self.sample_noise(key, obs.view.shape[:-4]))
 
     @stated_precision
@@ -190,8 +198,16 @@ class Policy:
 
     @stated_precision
     def encode_states(self, params: Any, states: chex.Array) -> chex.Array:
-        """(S, 1, rows, columns) -> (S, F), for `step`; cheapest for a NumPy array."""
+        """(S, C, rows, columns) -> (S, F), for `step`; cheapest for a NumPy array."""
         return self.module.apply(params, states, method=self.module.encode_states)
+
+    @stated_precision
+    def encode_listed(self, params: Any, states: SparseStates) -> chex.Array:
+        """(S, F) of the states a task lists, for `step`."""
+        if goes_with(type(self.module), "encode_listed", "encode_states"):
+            encode_listed = self.module.encode_listed
+            return self.module.apply(params, states, method=encode_listed)
+        return self.encode_states(params, states.dense())
 
     @stated_precision
     def prepare(self, params: Any) -> Any:
@@ -207,9 +223,72 @@ class Policy:
         step = self.module.apply(params, carry, state_features, view, noise)
         return cast(tuple[Any, PolicyOutput], step)
 
-    def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
-        """The random numbers of `batch_shape` steps."""
-        return self.module.sample_noise(key, batch_shape)
+    def sample_noise(
+        self, key: chex.PRNGKey, batch_shape: tuple[int, ...], greedy: chex.Numeric = False
+    ) -> Any:
+        """The random numbers of `batch_shape` steps.
+
+        Args:
+          greedy: those of `greedy_noise` instead; may be traced, so that both share a program.
+        """
+        noise = self.module.sample_noise(key, batch_shape)
+        if greedy is False:
+            return noise
+        none = self.greedy_noise(batch_shape)
+        return jax.tree.map(lambda zero, drawn: jnp.where(greedy, zero, drawn), none, noise)
+
+    def greedy_noise(self, batch_shape: tuple[int, ...] = ()) -> Any:
+        """What makes every choice of `batch_shape` steps the likeliest: zeros, of whatever type the
+        policy draws."""
+        like = jax.eval_shape(lambda: self.module.sample_noise(jax.random.key(0), batch_shape))
+        return jax.tree.map(lambda drawn: jnp.zeros(drawn.shape, drawn.dtype), like)
+
+    def check_fits(self, env: Environment) -> None:
+        """Whether the policy was made for a team and grid such as that of `env`.
+
+        Raises:
+          ValueError: when it was shaped for another task; names what differs, and both values.
+        """
+        spec = TeamSpec.of(env)
+        differ = [
+            f"{field.name} {getattr(self.team, field.name)} against {getattr(spec, field.name)}"
+            for field in fields(spec)
+            if getattr(self.team, field.name) != getattr(spec, field.name)
+        ]
+        if differ:
+            raise ValueError(
+                f"the policy was made for another task: {'; '.join(differ)}; call make_policy with "
+                "this environment (parameters of the same sizes still fit)."
+            )
+
+    def check_step(self, carry: Any, obs: Observation) -> None:
+        """Whether `carry` and `obs` are of this policy's team.
+
+        Raises:
+          ValueError: for shapes of another team, grid or batch; names both.
+        """
+        batch, team = obs.view.shape[:-4], self.team
+        shapes = {"state": team.state_shape, "view": team.view_shape}
+        for name, shape in shapes.items():
+            got, expected = jnp.shape(getattr(obs, name)), (*batch, team.num_agents, *shape)
+            if got != expected:
+                raise ValueError(
+                    f"the observation's {name} has shape {got}, but the policy was made for "
+                    f"{expected}; call make_policy with the task that is observed (parameters of "
+                    "the same sizes still fit)."
+                )
+        like = jax.eval_shape(lambda: self.initial_carry(batch))
+        got, expected = (jax.tree.map(jnp.shape, tree) for tree in (carry, like))
+        if got != expected:
+            raise ValueError(
+                f"the carry has shapes {jax.tree.leaves(got, is_leaf=_is_shape)}, but the policy's "
+                f"has {jax.tree.leaves(expected, is_leaf=_is_shape)} for this observation; start "
+                f"an episode with initial_carry({batch})."
+            )
+
+
+def _is_shape(x: Any) -> bool:
+    return isinstance(x, tuple)
 
 
 def decide(logits: chex.Array, gumbel: chex.Array) -> Decision:

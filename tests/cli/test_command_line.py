@@ -1,6 +1,5 @@
 """What a person can get wrong on the command line: one sentence, status 2, nothing left behind."""
 
-import os
 import re
 import subprocess
 import sys
@@ -14,7 +13,6 @@ import pytest
 from sumajax import checkpoint, cli
 from sumajax.cli import options as shared
 from sumajax.cli import transfer
-from sumajax.cli.transfer import PPTransfer
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import LearnerConfig, make_learner
 from sumajax.policies import make_policy
@@ -267,7 +265,7 @@ def test_a_mistake_gets_one_sentence(
     domain, options, sentence, there, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(transfer, "prepare_jax", lambda devices: None)
+    monkeypatch.setattr(transfer, "keep_compiled", lambda: None)
     compiled, before = len(COMPILED), files(there)
     began = time.process_time()
     with pytest.raises(SystemExit) as stop:
@@ -342,7 +340,7 @@ def test_without_a_home_nothing_is_kept_and_the_run_goes_on(home, tmp_path):
         "import os, pathlib, sys; from sumajax.cli import options; "
         "pathlib.Path.home = lambda: (_ for _ in ()).throw(RuntimeError('no home directory')) "
         "if sys.argv[1] == 'none' else pathlib.Path('/proc/nowhere'); "
-        "options.prepare_jax(1); print('goes on')"
+        "options.keep_compiled(); print('goes on')"
     )
     run = subprocess.run(
         [sys.executable, "-c", program, home], capture_output=True, text=True, check=True
@@ -350,10 +348,3 @@ def test_without_a_home_nothing_is_kept_and_the_run_goes_on(home, tmp_path):
     assert run.stdout == "goes on\n"
     (line,) = run.stderr.strip().splitlines()
     assert line.startswith("compiled programs are not kept (")
-
-
-def test_as_many_devices_as_fit(monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert PPTransfer().num_devices == 5  # of 8; 50 environments do not spread over more
-    assert PPTransfer(seeds=(0, 1, 2)).num_devices == 6
-    assert PPTransfer(devices=2).num_devices == 2

@@ -153,7 +153,7 @@ BAD = {
 def test_a_mistake_gets_one_sentence(arguments, sentence, run, pcp, tmp_path, monkeypatch, capsys):
     (tmp_path / "other").mkdir()
     (tmp_path / "mine.json").write_text("mine")
-    monkeypatch.setattr(program, "prepare_jax", lambda devices: None)
+    monkeypatch.setattr(program, "keep_compiled", lambda: None)
     names = {"tmp": tmp_path, "run": run, "pcp": pcp}
     arguments = [argument.format(**names) for argument in arguments]
     with pytest.raises(SystemExit) as stop:

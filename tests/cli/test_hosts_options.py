@@ -1,7 +1,6 @@
 """Options for several hosts: mistakes refused at once, and a run that goes on elsewhere."""
 
 import json
-import os
 
 import pytest
 
@@ -30,11 +29,6 @@ HERE = "127.0.0.1:1234"
 def test_mistakes(options, sentence):
     with pytest.raises(ValueError, match=sentence):
         PPTransfer(**options)
-
-
-def test_devices_of_each_host(monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert PPTransfer(hosts=2, coordinator=HERE).num_devices == 5  # ten in all, of 50 environments
 
 
 def test_a_run_goes_on_with_other_devices_and_hosts(tmp_path):

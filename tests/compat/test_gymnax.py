@@ -8,6 +8,7 @@ import pytest
 from sumajax.compat import spaces as own_spaces
 from sumajax.compat.gymnax import AutoReset
 from sumajax.environments import PredatorPrey
+from sumajax.upsampling import StateUpsampled
 
 TASK = PredatorPrey(size=3, num_predators=2, max_steps=3)
 ENV = AutoReset(TASK)
@@ -41,7 +42,7 @@ def test_the_time_limit_truncates_and_starts_afresh():
     assert truncated
     assert not terminated
     assert int(state.time) == 0
-    same((obs, state), ENV.reset(start))
+    same((obs, state), ENV.reset(jax.random.split(start)[1]))
     same(info["final_observation"], TASK.observe(TASK.step(last, STAY)[0]))
     assert int(info["steps_taken"]) == 3
 
@@ -62,6 +63,31 @@ def test_done_with_the_last_step_is_an_end_not_a_cut():
     *_, terminated, truncated, _ = ENV.step(jax.random.key(0), state, DOWN)
     assert terminated
     assert not truncated
+
+
+def test_the_reset_leaves_a_part_of_the_key():
+    """A wrapper or program may draw from the step's half; no episode may start from the whole."""
+    state = TASK.state_at([[0, 0], [2, 2]], [1, 0]).replace(time=jnp.int32(2))
+    key = jax.random.key(3)
+    _, fresh, *_ = ENV.step(key, state, STAY)
+    for used in (key, jax.random.split(key)[0]):
+        with pytest.raises(AssertionError):
+            same(fresh, ENV.reset(used)[1])
+
+
+def test_one_reward_for_the_team():
+    team = AutoReset(TASK, team_reward=True)
+    state = TASK.state_at([[0, 0], [2, 2]], [1, 0])
+    _, after, reward, *_ = team.step(jax.random.key(0), state, DOWN)
+    _, same_after, rewards, *_ = ENV.step(jax.random.key(0), state, DOWN)
+    assert reward.shape == ()
+    np.testing.assert_allclose(reward, rewards.mean())
+    assert rewards[0] != rewards[1]
+    same(after, same_after)
+
+
+def test_its_name_is_that_of_the_innermost_task():
+    assert AutoReset(StateUpsampled(StateUpsampled(TASK, 6), 12)).name == "PredatorPrey"
 
 
 def test_batched():
@@ -107,3 +133,19 @@ def test_gymnaxs_legacy_wrapper_takes_it():
     assert not done
     assert reward.shape == (2,)
     assert "final_observation" in info
+
+
+def test_gymnaxs_log_wrapper_takes_it_with_one_reward_for_the_team():
+    wrappers = pytest.importorskip(
+        "gymnax.wrappers", reason="gymnax is not installed (no dependency)"
+    )
+    logged = wrappers.LogWrapper(AutoReset(TASK, team_reward=True))
+    _, state = logged.reset(jax.random.key(0))
+
+    def step(state, key):
+        _, state, *_, info = logged.step(key, state, STAY)
+        return state, info
+
+    _, info = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 3))
+    assert info["returned_episode"].tolist() == [False, False, True]
+    np.testing.assert_allclose(info["returned_episode_returns"][-1], -0.15, rtol=1e-5)

@@ -135,6 +135,35 @@ class TestAutomaticReset:
         assert state.done
         assert int(state.step) == 4
 
+    def test_leaves_a_part_of_the_key(self, env):
+        _, state = env.reset(jax.random.key(0))
+        for _ in range(3):
+            _, state, *_ = env.step(jax.random.key(1), state, stays(env))
+        key = jax.random.key(2)
+        _, fresh, *_ = env.step(key, state, stays(env))
+        jax.tree.map(np.testing.assert_array_equal, fresh, env.reset(jax.random.split(key)[1])[1])
+
+
+class TestEquality:
+    def test_two_of_one_task_are_one(self):
+        one, same = compat.JaxMARLEnv(PP), compat.JaxMARLEnv(PredatorPrey(3, 2, max_steps=4))
+        assert one == same
+        assert hash(one) == hash(same)
+        assert one != compat.JaxMARLEnv(StateUpsampled(PP, 6))
+        assert one != PP
+
+    def test_they_are_compiled_once(self):
+        traces = []
+
+        def start(env, key):
+            traces.append(env)
+            return env.reset(key)
+
+        compiled = jax.jit(start, static_argnums=0)
+        for _ in range(2):
+            compiled(compat.JaxMARLEnv(PredatorPrey(3, 2, max_steps=4)), jax.random.key(0))
+        assert len(traces) == 1
+
 
 class TestAvailableActions:
     def test_are_the_mask(self, env):

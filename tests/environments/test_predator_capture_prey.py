@@ -196,7 +196,7 @@ def by_definition(env, before, actions, after):
         waits = -0.025 if env.capture_reward == "second" and there[i] else -0.05
         rewards.append(team[env.reward_mode] if done[i] else waits)
     terminated = env.reward_mode == "mixed" and all(done)
-    truncated = before.time + 1 == env.max_steps and not terminated
+    truncated = before.time + 1 >= env.max_steps and not terminated
     return rewards, terminated, truncated, all(done)
 
 

@@ -168,6 +168,15 @@ class TestEnd:
         assert [t.truncated.item() for t in transitions] == [False, False, True]
         assert not any(t.terminated | t.success for t in transitions)
 
+    def test_past_the_step_limit_every_step_is_cut_off_until_the_team_is_done(self):
+        """Whoever steps on, or comes with a state of a longer limit, is told."""
+        env = duo(max_steps=2)
+        late = start(env, agents=[[0, 1], [0, 3]]).replace(time=jnp.int32(7))
+        _, transitions = play(env, late, [[STAY, STAY], [RIGHT, STAY], [STAY, LEFT]])
+        assert [t.steps_taken.item() for t in transitions] == [8, 9, 10]
+        assert [t.truncated.item() for t in transitions] == [True, True, False]
+        assert [t.terminated.item() for t in transitions] == [False, False, True]
+
     def test_success_with_the_last_allowed_step_is_an_end_not_a_cut(self):
         env = duo(max_steps=2)
         state = start(env, agents=[[0, 1], [0, 4]])

@@ -143,7 +143,7 @@ def test_the_policy_of_a_run_can_be_used(finished):
     directory = finished[0]
     agent = load_agent(directory, seed=1)
     assert agent.env == LARGE, "of a run the last stage is meant"
-    with pytest.raises(ValueError, match=r"holds seeds \[0, 1\], not 2"):
+    with pytest.raises(ValueError, match=r"has no seed 2; its seeds are 0, 1"):
         load_agent(directory, seed=2)
 
 

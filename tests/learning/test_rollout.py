@@ -90,7 +90,7 @@ def test_the_bootstrap_is_the_value_of_the_likeliest_next_step():
     env, policy, params, _, _ = scene()
     following, _ = rolled()
     ours = jax.jit(partial(last_value, env, policy))(params, following)
-    greedy = jax.tree.map(jnp.zeros_like, policy.sample_noise(jax.random.key(0), (ENVS,)))
+    greedy = policy.greedy_noise((ENVS,))
     obs = jax.vmap(env.observe)(following.env_state)
     _, output = jax.jit(policy.apply_with)(params, following.carry, obs, greedy)
     np.testing.assert_allclose(ours, output.value, rtol=1e-5, atol=1e-6)

@@ -43,8 +43,7 @@ def stepper(policy: Policy) -> Any:
 
 def greedy(policy: Policy, batch_shape: tuple[int, ...] = ()) -> Any:
     """The noise that makes every choice the likeliest."""
-    noise = jax.eval_shape(lambda: policy.sample_noise(jax.random.key(0), batch_shape))
-    return jax.tree.map(lambda draw: np.zeros(draw.shape, draw.dtype), noise)
+    return policy.greedy_noise(batch_shape)
 
 
 def observe(env: Any, seed: int, batch_shape: tuple[int, ...] = ()) -> Observation:

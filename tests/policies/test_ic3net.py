@@ -68,10 +68,20 @@ def test_the_gate_is_chosen_one_step_ahead():
     carry, output = stepper(policy)(params, start, observe(PREY_THREE, 0), noise)
     np.testing.assert_array_equal(output.decisions["gate"].choice, [1, 0, 1])
     np.testing.assert_array_equal(carry.gate, [1, 0, 1])
-    np.testing.assert_array_equal(output.communication, [1, 0, 1])
+    np.testing.assert_array_equal(output.communication, [0, 0, 0])
     np.testing.assert_array_equal(output.attention, np.zeros((3, 3)))
     _, output = stepper(policy)(params, carry, observe(PREY_THREE, 1), noise)
+    np.testing.assert_array_equal(output.communication, [1, 0, 1])
     np.testing.assert_array_equal(output.attention, [[0, 0, 0.5], [0, 0, 0], [0.5, 0, 0]])
+
+
+@pytest.mark.parametrize(("name", "share"), [("commnet", 1), ("iric", 0)])
+def test_without_a_gate_the_share_is_that_of_the_kind(name, share):
+    policy = small(name)
+    carry, obs, noise = policy.initial_carry(), observe(PREY_THREE, 0), greedy(policy)
+    for _ in range(2):
+        carry, output = stepper(policy)(parameters(policy), carry, obs, noise)
+        np.testing.assert_array_equal(output.communication, [share] * 3)
 
 
 def test_what_is_decided_besides_the_action():

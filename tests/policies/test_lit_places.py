@@ -1,11 +1,15 @@
 """Encoding known states by the places they light is encoding them whole."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sumajax.environments import PredatorPrey
+from sumajax.environments import PredatorPrey, SparseStates
+from sumajax.environments.states import listed_states
 from sumajax.policies.encoder import StateEncoder
 from sumajax.policies.lit_places import lit_places, sum_by_state
 from sumajax.upsampling import StateUpsampled
@@ -27,6 +31,7 @@ STATES = {
     "some lit": random_states(0.1),
     "all lit": random_states(1.0),
     "one cell": jnp.ones((1, 1, 1, 1)),
+    "two channels": np.concatenate([random_states(0.1), random_states(0.3)], axis=1),
 }
 
 
@@ -62,7 +67,7 @@ def test_known_states_have_the_features_and_gradients_of_states_given(name):
 def test_only_lit_places_are_kept():
     """A one-hot cell of a 20x20 grid lights at most 3x3 of 10x10 places."""
     encoder = StateEncoder().bind(parameters(jnp.zeros((1, 1, 20, 20))))
-    states = np.moveaxis(np.asarray(PredatorPrey(size=20).state_table()), 1, -1)
+    states = PredatorPrey(size=20).sparse_states()
     places = lit_places(states, encoder.conv1.patches, encoder.conv2.patches)
     of_state = np.bincount(places.state.ravel(), minlength=401)
     assert places.num_states == 400
@@ -75,10 +80,45 @@ def test_only_lit_places_are_kept():
 
 
 def test_sums_by_state_leave_out_what_fills_up():
-    states = np.zeros((2, 4, 4, 1), np.float32)
-    states[1, 0, 0] = 1
+    states = SparseStates(np.array([[0], [0]]), np.array([[0.0], [1.0]]), (1, 4, 4))
     encoder = StateEncoder().bind(parameters(jnp.zeros((1, 1, 4, 4))))
     places = lit_places(states, encoder.conv1.patches, encoder.conv2.patches)
     ones = jnp.ones((*places.state.shape, 3))
     lit = (places.state == 1).sum()
     np.testing.assert_array_equal(sum_by_state(ones, places), [[0] * 3, [lit] * 3])
+
+
+@pytest.mark.parametrize(
+    "task", [PredatorPrey, lambda size: StateUpsampled(PredatorPrey(size=size // 2), size)]
+)
+def test_tables_grow_with_the_cells_and_not_with_their_square(task):
+    encoder = StateEncoder().bind(parameters(jnp.zeros((1, 1, 4, 4))))
+    per_cell = []
+    for size in (20, 40, 60):
+        places = lit_places(listed_states(task(size)), encoder.conv1.patches, encoder.conv2.patches)
+        tables = (places.seen, places.exists, places.state)
+        per_cell.append(sum(table.nbytes for table in tables) / size**2)
+    np.testing.assert_allclose(per_cell, per_cell[0], rtol=0.01)
+
+
+FIRST_UPDATE = """
+import resource
+import jax
+from sumajax import make_learner, make_policy
+from sumajax.environments import PredatorPrey
+
+env = PredatorPrey(size=100, num_predators=50)
+learner = make_learner(env, make_policy("ic3net", env))
+state, tally = jax.jit(learner.update)(jax.jit(learner.init)(jax.random.key(0)))
+assert int(tally.updates) == 1
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+MOST_GIGABYTES = 4
+"""Measured: 1.2 GB."""
+
+
+@pytest.mark.slow
+def test_the_first_update_of_fifty_agents_on_100x100_fits_a_small_machine():
+    done = subprocess.run([sys.executable, "-c", FIRST_UPDATE], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) / 2**20 < MOST_GIGABYTES

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sumajax.policies import TeamSpec
+from sumajax.policies import Policy, TeamSpec
+from sumajax.policies.ic3net import IC3Net
 from sumajax.policies.types import MASKED_LOGIT, decide, mask_actions
 
 from .teams import (
@@ -89,6 +90,18 @@ def test_blind_agents_do_not_read_their_view(name):
 
 
 @each_policy
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+def test_greedy_noise_is_zeros_like_what_is_drawn(name, batch):
+    policy, key = small(name, CAPTURE_THREE), jax.random.key(0)
+    drawn, noise = policy.sample_noise(key, batch), policy.greedy_noise(batch)
+    chex.assert_trees_all_equal_shapes_and_dtypes(noise, drawn)
+    assert not any(leaf.any() for leaf in jax.tree.leaves(noise))
+    either = jax.jit(policy.sample_noise, static_argnums=1)
+    chex.assert_trees_all_equal(either(key, batch, True), noise)
+    chex.assert_trees_all_equal(either(key, batch, False), drawn)
+
+
+@each_policy
 def test_zero_noise_is_greedy(name):
     for output in play(small(name, CAPTURE_THREE), CAPTURE_THREE, seeds=[0, 1]):
         for decision in output.decisions.values():
@@ -162,6 +175,26 @@ def test_what_is_prepared_for_many_steps_changes_nothing(name):
     (gradient, output), expected = gradient_and_output(from_table), gradient_and_output(direct)
     chex.assert_trees_all_close(output, expected[1], atol=1e-5)
     chex.assert_trees_all_close(gradient, expected[0], atol=1e-4, rtol=1e-4)
+
+
+@each_policy
+def test_a_listed_state_is_encoded_as_the_state_itself(name):
+    policy, states = small(name, CAPTURE_THREE), CAPTURE_THREE.sparse_states()
+    listed = jax.jit(lambda params: policy.encode_listed(params, states))(parameters(policy))
+    direct = jax.jit(policy.encode_states)(parameters(policy), jnp.asarray(states.dense()))
+    np.testing.assert_allclose(listed, direct, atol=1e-5)
+
+
+def test_a_module_that_encodes_anew_is_given_whole_states():
+    class Doubled(IC3Net):
+        def encode_states(self, states):
+            return super().encode_states(2 * states)
+
+    module = Doubled(small("ic3net").team, hidden=16)
+    policy, states = Policy("doubled", module), PREY_THREE.sparse_states()
+    params = parameters(small("ic3net"))
+    expected = policy.encode_states(params, jnp.asarray(states.dense()))
+    np.testing.assert_allclose(policy.encode_listed(params, states), expected, atol=1e-5)
 
 
 @each_policy
