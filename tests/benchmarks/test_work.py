@@ -4,11 +4,9 @@ The bounds are what was counted when they were set (c152d25), and a margin for o
 XLA. A change that does less may lower them; one that does more has to say what for.
 """
 
-import re
-from collections import Counter
-
 import jax
 import pytest
+from compiled_loops import loops_of
 from matrix_products import multiply_adds, products
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
@@ -22,8 +20,6 @@ MULTIPLY_ADDS = [("ic3net", PP, 2_419_000), ("magic", PP, 2_646_000), ("hetnet",
 """Per environment step: rollout, loss and derivatives, the table of states included."""
 OPERATIONS = [("ic3net", PP, 148), ("magic", PP, 307), ("hetnet", PCP, 515)]
 """Operations that the two scan bodies of an update start, forward and back together."""
-FREE = {"parameter", "get-tuple-element", "tuple", "bitcast", "constant"}
-"""Instructions of a compiled program that do nothing when it runs."""
 
 
 def update_of(name, env):
@@ -50,16 +46,8 @@ def test_operations_of_a_step(name, env, bound):
 
 def operations_of_loops(program):
     """Operations that one turn of each loop starts, the largest loop first."""
-    started, bodies, computation = Counter(), set(), ""
-    for line in program.splitlines():
-        if header := re.match(r"%?([\w.\-]+) .*\{$", line):
-            computation = header[1]
-        elif instruction := re.match(
-            r"\s+(?:ROOT )?%?[\w.\-]+ = (?:\(.*?\)|\S+) ([\w\-]+)\(", line
-        ):
-            started[computation] += instruction[1] not in FREE
-            bodies |= set(re.findall(r"body=%?([\w.\-]+)", line))
-    return sorted((started[body] for body in bodies), reverse=True)
+    _, *loops = loops_of(program).all_loops()
+    return sorted((loop.operations for loop in loops), reverse=True)
 
 
 def test_operations_are_counted_by_loop():
