@@ -1,5 +1,6 @@
 """What a person can get wrong on the command line: one sentence, status 2, nothing left behind."""
 
+import json
 import re
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from sumajax import checkpoint, cli
+from sumajax.checkpoint.format import checksum
 from sumajax.cli import options as shared
 from sumajax.cli import transfer
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
@@ -218,9 +220,10 @@ def make_sources(directory: Path) -> None:
     (save("without_description", few, described) / checkpoint.DESCRIPTION).unlink()
     truncated = save("truncated", few, described)
     max(truncated.rglob("*/d/*"), key=lambda file: file.stat().st_size).write_bytes(b"")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sumajax.checkpoint.writing.VERSION", 99)
-        save("newer", few, described)
+    newer = save("newer", few, described) / checkpoint.DESCRIPTION
+    content = {**json.loads(newer.read_text()), "version": 99}
+    del content["checksum"]
+    newer.write_text(json.dumps({**content, "checksum": checksum(content)}))
 
 
 def is_action_bias(path) -> bool:
