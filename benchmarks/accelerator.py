@@ -67,6 +67,20 @@ MARGIN = 5.0
 """Seconds before the end at which nothing new is begun."""
 COMPILING = 6
 """Programs compiled at once: their tracing takes turns, XLA's part does not."""
+FIGURES = (
+    "env_steps",
+    "episodes",
+    "steps_taken",
+    "success",
+    "episode_return",
+    "entropy",
+    "policy_loss",
+    "value_loss",
+    "gradient_norm",
+    "communication",
+    "fault",
+)
+"""Of an epoch, in a job's `.csv`."""
 MATRIX_SIDE = {"cpu": 1024}
 LARGE_MATRIX_SIDE = 8192
 """Side of the product that gives the device's rate; by platform, and on an accelerator."""
@@ -528,12 +542,13 @@ def train_leg(
 
 def write_metrics(file: Path, metrics: Metrics, first_epoch: int, seeds: list[int]) -> None:
     """Adds a line per seed and epoch."""
-    columns = {name: np.asarray(value) for name, value in vars(jax.device_get(metrics)).items()}
+    known = jax.device_get(metrics)
+    columns = {name: np.asarray(getattr(known, name)) for name in FIGURES}
     with file.open("a", newline="") as out:
         writer = csv.writer(out)
         if not out.tell():
             writer.writerow(["epoch", "seed", *columns])
-        for epoch in range(next(iter(columns.values())).shape[1]):
+        for epoch in range(columns[FIGURES[0]].shape[1]):
             for i, seed in enumerate(seeds):
                 cells = [column[i, epoch] for column in columns.values()]
                 writer.writerow([first_epoch + epoch + 1, seed, *cells])
