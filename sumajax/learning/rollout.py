@@ -209,23 +209,17 @@ def relive(
     cut = trajectory.last | (trajectory.steps_taken % gap == 0)  # (T, E): after the step
     begins = jnp.roll(cut, 1, axis=0).at[0].set(True)
     pieces = windows(begins, gap)
-    own = None
-    if features is None:  # too many states to list: all that were met, encoded as one batch
-        met = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), before.env_state)
-        own = own_features(env, policy, params, None, met)
-        own = own.reshape(*cut.shape, *own.shape[1:])
 
-    def body(carry: Any, now: tuple[chex.Array, Actors, Any, Any]) -> tuple[Any, Any]:
-        begins, actors, noise, own = now
-        carry = select(begins, actors.carry, carry)
-        if own is None:
-            own = own_features(env, policy, params, features, actors.env_state)
-        view = jax.vmap(env.view)(actors.env_state)
-        carry, output = policy.step(params, carry, own, view, noise)
+    # States too many to list are encoded step by step here as well: as one batch of all that were
+    # met they took a quarter longer, as they no longer fit a core's cache.
+    def body(carry: Any, now: tuple[chex.Array, Actors, Any]) -> tuple[Any, Any]:
+        begins, actors, noise = now
+        actors = replace(actors, carry=select(begins, actors.carry, carry))
+        carry, output = act(env, policy, params, features, actors, noise)
         logits = {name: decision.logits for name, decision in output.decisions.items()}
         return carry, (logits, output.value)
 
-    steps = pieces.split((begins, before, noise, own))
+    steps = pieces.split((begins, before, noise))
     beginning = policy.initial_carry(steps[0].shape[1:])
     _, again = jax.lax.scan(body, beginning, steps, unroll=unroll)
     logits, value = pieces.join(again)

@@ -46,7 +46,7 @@ class PolicyOutput:
     value: chex.Array  # (..., N) float32: expected return of each agent
     communication: (
         chex.Array
-    )  # (..., N) float32 in [0, 1]: share of its means an agent used to talk
+    )  # (..., N) float32 in [0, 1]: share of its means an agent used to talk in this step
     attention: chex.Array  # (..., N, N) float32: weight of sender j (column) at receiver i (row)
 
     @property
