@@ -91,7 +91,7 @@ def usable_cores(root: Path = Path("/")) -> int:
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    return max(1, min(cores, math.floor(_container_share(root))))
+    return max(1, math.floor(min(cores, _container_share(root))))
 
 
 def _container_share(root: Path) -> float:
