@@ -10,6 +10,8 @@ from sumajax import make_policy
 from sumajax.environments import PredatorCapturePrey
 from sumajax.keys import key_of
 
+pytest.importorskip("flatbuffers", reason="jax.export writes with flatbuffers, not installed")
+
 ENV = PredatorCapturePrey(size=3, num_predators=2, num_capturers=1, max_steps=6)
 
 

@@ -91,7 +91,7 @@ def usable_cores(root: Path = Path("/")) -> int:
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    return max(1, min(cores, math.floor(_container_share(root))))
+    return max(1, math.floor(min(cores, _container_share(root))))
 
 
 def _container_share(root: Path) -> float:
@@ -138,10 +138,11 @@ def available_devices() -> list[jax.Device]:
     """
     try:
         return jax.local_devices()
-    except RuntimeError as error:
+    except (RuntimeError, AssertionError) as error:  # a bare assertion where no CUDA is found
+        said = (str(error).splitlines() or ["none is there"])[0]
         raise ValueError(
             f"JAX finds no device of the kind that JAX_PLATFORMS={_platforms()!r} asks "
-            f"for ({str(error).splitlines()[0]}); unset JAX_PLATFORMS, or install what drives it."
+            f"for ({said}); unset JAX_PLATFORMS, or install what drives it."
         ) from None
 
 
