@@ -30,21 +30,23 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import tyro
 
-PolicyName = Literal["ic3net", "commnet", "iric", "ic", "magic", "hetnet", "hetnet-binary"]
-TaskName = Literal["pp-5x5-3p", "pp-10x10-5p", "pp-20x20-10p", "pcp-10x10-3p2c"]
-POLICY_NAMES: tuple[PolicyName, ...] = (
+PolicyName = Literal[
     "ic3net",
     "commnet",
     "iric",
     "ic",
     "magic",
+    "tarmac",
+    "tarmac-ic3net",
     "hetnet",
     "hetnet-binary",
-)
+]
+TaskName = Literal["pp-5x5-3p", "pp-10x10-5p", "pp-20x20-10p", "pcp-10x10-3p2c"]
+POLICY_NAMES: tuple[PolicyName, ...] = get_args(PolicyName)
 TASK_NAMES: tuple[TaskName, ...] = ("pp-5x5-3p", "pp-10x10-5p", "pp-20x20-10p", "pcp-10x10-3p2c")
 
 

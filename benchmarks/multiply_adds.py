@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from sumajax.environments.types import Environment
 from sumajax.policies.encoder import STATE_FEATURES, VIEW_FEATURES, VIEW_KERNEL
+from sumajax.policies.tarmac import KEY_FEATURES
 from sumajax.policies.types import TeamSpec
 
 HIDDEN = 128
@@ -65,6 +66,15 @@ def magic(team: TeamSpec) -> int:
     return agents * own + agents**2 * pair
 
 
+def tarmac(team: TeamSpec, gated: bool = True, rounds: int = 1) -> int:
+    """Queries, signatures and values of `KEY_FEATURES` and 128; the LSTM runs in every round."""
+    agents = team.num_agents
+    of_round = lstm(HIDDEN, HIDDEN) + 2 * HIDDEN * HIDDEN + 2 * HIDDEN * KEY_FEATURES
+    heads = HIDDEN * (team.num_actions + 1 + 2 * gated)
+    pairs = rounds * agents**2 * (KEY_FEATURES + HIDDEN)
+    return agents * (encoder(team) + rounds * of_round + heads) + pairs
+
+
 LAYER_WIDTH, LAYER_HEADS = 16, 4
 STATE_WIDTH, META = 8, 4
 
@@ -108,6 +118,8 @@ COUNTS: dict[str, Callable[[TeamSpec], int]] = {
     "iric": lambda team: ic3net(team, communicates=False, gated=False),
     "ic": lambda team: ic3net(team, communicates=False, gated=False),
     "magic": magic,
+    "tarmac": lambda team: tarmac(team, gated=False),
+    "tarmac-ic3net": tarmac,
     "hetnet": hetnet,
 }
 """By policy name; binary messages are counted as the real-valued ones they replace."""

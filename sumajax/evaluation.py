@@ -16,7 +16,7 @@ from sumajax.checkpoint import CheckpointError
 from sumajax.description import rebuild_policy, rebuild_task
 from sumajax.environments.types import Environment, Observation
 from sumajax.keys import key_of
-from sumajax.learning.rollout import Actors, act, select, state_features
+from sumajax.learning.rollout import Actors, act, hand_on, presence_in, select, state_features
 from sumajax.policies.types import Policy
 from sumajax.records import exportable
 from sumajax.transfer import checkpoints_of
@@ -131,6 +131,7 @@ def _play(
         carry, actions = choose(actors, jax.random.fold_in(key, queue.time))
         env_state, transition = jax.vmap(env.step)(actors.env_state, actions)
         episode_return = actors.episode_return + transition.reward
+        carry = hand_on(policy, carry, presence_in(env, actors.env_state, transition, env_state))
         done = transition.terminated | transition.truncated
         now = Evaluation(transition.steps_taken, transition.success, episode_return.mean(-1))
         # A row past the end is dropped.

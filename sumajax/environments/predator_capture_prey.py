@@ -149,6 +149,9 @@ class PredatorCapturePrey:
     def active(self, state: State) -> chex.Array:
         return active(self, state)
 
+    def alive(self, state: State) -> chex.Array:
+        return jnp.ones(self.num_agents, bool)
+
     def shortest_steps(self, state: State) -> chex.Array:
         return shortest_steps(self, state)
 

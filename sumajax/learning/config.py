@@ -15,6 +15,7 @@ Optimiser = Literal["adam", "rmsprop"]
 Loss = Literal["actor_critic", "hetnet"]
 Preset = Literal["fast", "paper"]
 Advantages = Literal["raw", "centred", "normalised"]
+AliveMask = Literal["before", "after"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,9 @@ class LearnerConfig:
         as well.
       mask_inactive: no policy gradient for actions that no longer change anything; what an agent
         that has arrived says is still trained.
+      alive_mask: where agents come and go, which of them count in a step: those there `before` it,
+        or, as in the originals, `after` it. Then the last step of who leaves is not learnt from,
+        that before a newcomer's first is, and the newcomer's reward is paid to who has left.
       loss: `actor_critic`, or `hetnet`, the per-class loss of HetNet's published program, which
         is of whole episodes only and normalises advantages in its own way.
       value_weight, policy_weight, entropy_weight: of the critic's squared error, of the policy
@@ -63,6 +67,7 @@ class LearnerConfig:
     team_reward: float = 0.2
     advantages: Advantages = "centred"
     mask_inactive: bool = True
+    alive_mask: AliveMask = "before"
     loss: Loss = "actor_critic"
     value_weight: float = 0.5
     policy_weight: float = 1.0
@@ -103,7 +108,7 @@ class LearnerConfig:
 
 
 _PUBLISHED: dict[str, Any] = {
-    # Singh et al. 2019 and its published program; MAGIC and HetNet build on the same trainer.
+    # Singh et al. 2019 and its published program; MAGIC, TarMAC and HetNet build on its trainer.
     "num_envs": 4,  # processes of the paper's runs (VII-C)
     "rollout_length": 500,  # batch_size per process
     "whole_episodes": True,
@@ -113,6 +118,7 @@ _PUBLISHED: dict[str, Any] = {
     "team_reward": 0.0,
     "advantages": "raw",
     "mask_inactive": False,
+    "alive_mask": "after",
     "value_weight": 0.01,
     "entropy_weight": 0.0,
     "optimiser": "rmsprop",
@@ -139,13 +145,20 @@ _HETNET: dict[str, Any] = {
 _TEAM = {"team_reward": 1.0}
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    "fast": {"commnet": _TEAM, "ic": _TEAM, "iric": {"team_reward": 0.0}},
+    "fast": {
+        "commnet": _TEAM,
+        "ic": _TEAM,
+        "iric": {"team_reward": 0.0},
+        "tarmac": _TEAM,
+    },
     "paper": {
         "ic3net": _PUBLISHED,
         "commnet": {**_PUBLISHED, **_TEAM},
         "iric": _PUBLISHED,
         "ic": {**_PUBLISHED, **_TEAM},
         "magic": {**_PUBLISHED, "value_weight": 0.015},
+        "tarmac": {**_PUBLISHED, **_TEAM},
+        "tarmac-ic3net": _PUBLISHED,
         "hetnet": _HETNET,
         "hetnet-binary": _HETNET,
     },
@@ -222,6 +235,7 @@ def _validate(config: LearnerConfig) -> None:
         ("optimiser", Optimiser),
         ("loss", Loss),
         ("advantages", Advantages),
+        ("alive_mask", AliveMask),
     ):
         if getattr(config, name) not in get_args(choices):
             raise ValueError(

@@ -302,10 +302,10 @@ def until_episode_end(trajectory: Trajectory, least: int) -> chex.Array:
 
 
 def tally_of(trajectory: Trajectory, valid: chex.Array, parts: LossParts) -> Tally:
-    """Counts what `valid` (T, E) steps hold."""
+    """Counts what `valid` (T, E) steps hold; an agent that is not there has no step."""
     ended, num_agents = trajectory.last & valid, trajectory.value.shape[-1]
     env_steps = valid.sum(dtype=jnp.int32)
-    return Tally(
+    tally = Tally(
         env_steps=env_steps,
         episodes=ended.sum(dtype=jnp.int32),
         steps_taken=jnp.where(ended, trajectory.steps_taken, 0).sum(dtype=jnp.int32),
@@ -318,6 +318,14 @@ def tally_of(trajectory: Trajectory, valid: chex.Array, parts: LossParts) -> Tal
         updates=jnp.int32(1),
         faults=jnp.zeros(len(guard.FAULTS), jnp.int32),
     )
+    if trajectory.presence is None:
+        return tally
+    acted = trajectory.presence.before & valid[..., None]
+    agent_steps = acted.sum(dtype=jnp.int32)
+    used = jnp.where(acted, trajectory.communication, 0.0).sum()
+    share = used / jnp.maximum(agent_steps, 1).astype(used.dtype)
+    communication = share * tally.env_steps.astype(used.dtype)
+    return replace(tally, communication=communication, agent_steps=agent_steps)
 
 
 def summarise(tally: Tally) -> Metrics:
@@ -334,7 +342,11 @@ def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None 
     """The learner of `policy` on `env`; `config` defaults to the preset `fast`.
 
     Raises:
-      ValueError: when the policy was shaped for another task.
+      ValueError: when the policy was shaped for another task, or the loss does not fit the task.
     """
     policy.check_fits(env)
+    if config is not None and config.loss == "hetnet" and policy.team.agents_leave:
+        raise ValueError(
+            "loss 'hetnet' has no place for agents that come and go; use loss 'actor_critic'."
+        )
     return Learner(env, policy, config or LearnerConfig())

@@ -5,6 +5,7 @@ sum to differentiate and `LossParts` to report; `learner.LOSSES` names them.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import chex
 import jax
@@ -98,15 +99,55 @@ def estimate_advantages(
 
     A step limit is no end of the task: with `bootstrap_timeouts` the value of the observation after
     it, which the rollout never encodes, is taken to be that of the observation before it.
+    Where agents come and go, nothing is passed on from an agent to the one that takes its place;
+    the reward of a newcomer's first step, in which it has not acted, is left out, or with
+    `alive_mask` `after` added to who had the place before, as in the originals.
     """
     value, last_value = jax.lax.stop_gradient((trajectory.value, last_value))
-    reward = trajectory.reward
+    reward, presence = trajectory.reward, trajectory.presence
+    if presence is not None and config.alive_mask == "before":
+        reward = jnp.where(presence.entered, 0.0, reward)
     if config.bootstrap_timeouts:
-        reward = reward + config.gamma * trajectory.truncated[..., None].astype(value.dtype) * value
-    ongoing = jnp.broadcast_to(~trajectory.last[..., None], value.shape).astype(value.dtype)
+        goes_on = trajectory.truncated[..., None]
+        goes_on = goes_on if presence is None else goes_on & ~presence.left
+        reward = reward + config.gamma * goes_on.astype(value.dtype) * value
+    ongoing = jnp.broadcast_to(~trajectory.last[..., None], value.shape)
+    ongoing = (ongoing if presence is None else ongoing & ~presence.left).astype(value.dtype)
     return returns.generalised_advantages(
         reward, config.gamma * ongoing, value, last_value, config.gae_lambda
     )
+
+
+def estimate_returns(
+    trajectory: Trajectory, last_value: chex.Array, config: LearnerConfig
+) -> chex.Array:
+    """(T, E, N) what the critic is to learn: advantage plus value, partly the team's mean of it.
+
+    The team's part is the mean over its N places, whoever holds them: it goes on where a place is
+    handed on, and an empty place is worth nothing (as in the originals' team mean).
+    """
+    value = jax.lax.stop_gradient(trajectory.value)
+    own = estimate_advantages(trajectory, last_value, config) + value
+    presence = trajectory.presence
+    if presence is None or config.team_reward == 0.0:
+        return returns.mix_team(own, config.team_reward)
+    value = jnp.where(presence.before, value, 0.0)
+    places = replace(trajectory, value=value, presence=None)
+    beyond = jnp.where(presence.after[-1], last_value, 0.0)
+    of_places = estimate_advantages(places, beyond, config) + value
+    return returns.mix_team(own, config.team_reward, of_places)
+
+
+def counted(trajectory: Trajectory, valid: chex.Array, config: LearnerConfig) -> chex.Array:
+    """(T, E, N) float32, 1 for the agent-steps that are learnt from.
+
+    Those of the `valid` (T, E) steps, and where agents come and go of who is there, before or after
+    the step as `alive_mask` says.
+    """
+    weight = jnp.broadcast_to(valid[..., None], trajectory.value.shape).astype(jnp.float32)
+    if trajectory.presence is None:
+        return weight
+    return jnp.where(getattr(trajectory.presence, config.alive_mask), weight, 0.0)
 
 
 def actor_critic(
@@ -130,10 +171,9 @@ def actor_critic(
     Source: Singh et al. 2019, section 3.2; Mnih et al. 2016 for the entropy.
     """
     chex.assert_equal_shape([trajectory.value, trajectory.reward])
-    weight = jnp.broadcast_to(valid[..., None], trajectory.value.shape).astype(jnp.float32)
+    weight = counted(trajectory, valid, config)
     value = jax.lax.stop_gradient(trajectory.value)
-    individual = estimate_advantages(trajectory, last_value, config) + value
-    target = returns.mix_team(individual, config.team_reward)
+    target = estimate_returns(trajectory, last_value, config)
     advantages = target - value
     acting = weight * trajectory.active.astype(weight.dtype) if config.mask_inactive else weight
     advantages = ADVANTAGES[config.advantages](advantages, acting, axis)

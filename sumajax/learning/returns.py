@@ -48,7 +48,13 @@ def generalised_advantages(
     return discounted_returns(delta, discount * lambda_, jnp.zeros_like(last_value))
 
 
-def mix_team(individual: chex.Array, team_weight: float) -> chex.Array:
-    """(..., N): each agent's own part and the team's mean, weighted (the originals' mean_ratio)."""
-    team = individual.mean(-1, keepdims=True)
+def mix_team(
+    individual: chex.Array, team_weight: float, places: chex.Array | None = None
+) -> chex.Array:
+    """(..., N): each agent's own part and the team's mean, weighted (the originals' mean_ratio).
+
+    The mean is that of `places` (..., N), the returns of the agents' places, where these are not
+    the agents' own.
+    """
+    team = (individual if places is None else places).mean(-1, keepdims=True)
     return team_weight * team + (1.0 - team_weight) * individual

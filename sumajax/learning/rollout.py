@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from sumajax.environments.states import listed_states
-from sumajax.environments.types import Environment
+from sumajax.environments.types import Environment, Transition, agents_leave
 from sumajax.learning.windows import windows
 from sumajax.policies.types import Decision, Policy
 from sumajax.records import exportable
@@ -34,6 +34,20 @@ class Draws:
 
 
 @struct.dataclass
+class Presence:
+    """Who was there in a step, in a task whose agents come and go within an episode."""
+
+    before: chex.Array  # (..., N) bool: when it acted
+    after: chex.Array  # (..., N) bool: after the step; where `left` it is another agent
+    left: chex.Array  # (..., N) bool: went for good with this step
+
+    @property
+    def entered(self) -> chex.Array:
+        """(..., N) bool: has come with this step, into a place that was empty or was left."""
+        return self.after & (~self.before | self.left)
+
+
+@struct.dataclass
 class Trajectory:
     """What T steps of E environments left behind."""
 
@@ -49,6 +63,7 @@ class Trajectory:
     episode_return: chex.Array  # (T, E, N) float32: up to and including this step
     agent_class: tuple[int, ...] = struct.field(pytree_node=False)  # per agent
     max_steps: int = struct.field(pytree_node=False)  # the task's step limit
+    presence: Presence | None = None  # leaves (T, E, N); None where nobody ever leaves
 
     @property
     def last(self) -> chex.Array:
@@ -80,10 +95,11 @@ def draw(env: Environment, policy: Policy, keys: chex.PRNGKey, length: int) -> D
 
 
 def select(condition: chex.Array, if_true: Any, if_false: Any) -> Any:
-    """Leaf by leaf, along the leading axis of `condition` (E,)."""
+    """Leaf by leaf, along the leading axes that `condition` has, (E,) or (E, N)."""
 
     def leaf(a: chex.Array, b: chex.Array) -> chex.Array:
-        return jnp.where(condition.reshape(condition.shape + (1,) * (b.ndim - 1)), a, b)
+        missing = (1,) * (b.ndim - condition.ndim)
+        return jnp.where(condition.reshape(condition.shape + missing), a, b)
 
     return jax.tree.map(leaf, if_true, if_false)
 
@@ -106,7 +122,8 @@ def act(
     """The policy's step in all environments: (carry, PolicyOutput)."""
     own = own_features(env, policy, params, features, actors.env_state)
     view = jax.vmap(env.view)(actors.env_state)
-    return policy.step(params, actors.carry, own, view, noise)
+    alive = who_is_alive(env, actors.env_state)
+    return policy.step(params, actors.carry, own, view, noise, alive)
 
 
 def own_features(
@@ -118,6 +135,28 @@ def own_features(
     states = jax.vmap(env.observe)(env_state).state
     flat = states.reshape(-1, *states.shape[-3:])
     return policy.encode_states(params, flat).reshape(*states.shape[:-3], -1)
+
+
+def who_is_alive(env: Environment, env_state: Any) -> chex.Array | None:
+    """(E, N) bool: who is there; None where nobody ever leaves."""
+    return jax.vmap(env.alive)(env_state) if agents_leave(env) else None
+
+
+def presence_in(
+    env: Environment, env_state: Any, transition: Transition, following: Any
+) -> Presence | None:
+    """Who was there in the step from states `env_state` (E,) to `following`; None: always all."""
+    if not agents_leave(env):
+        return None
+    alive = jax.vmap(env.alive)
+    return Presence(before=alive(env_state), after=alive(following), left=transition.left)
+
+
+def hand_on(policy: Policy, carry: Any, presence: Presence | None) -> Any:
+    """What the agents remember after a step; nothing, for who is new, if the policy says so."""
+    if presence is None or not policy.fresh_memory:
+        return carry
+    return select(presence.entered, policy.initial_carry(presence.entered.shape[:1]), carry)
 
 
 def rollout(
@@ -162,6 +201,8 @@ def play(
         env_state, transition = jax.vmap(env.step)(actors.env_state, output.action)
         episode_return = actors.episode_return + transition.reward
         done = transition.terminated | transition.truncated
+        presence = presence_in(env, actors.env_state, transition, env_state)
+        carry = hand_on(policy, carry, presence)
         following = Actors(
             env_state=select(done, draws.fresh, env_state),
             carry=select(done, beginning, carry),
@@ -180,6 +221,7 @@ def play(
             steps_taken=transition.steps_taken,
             agent_class=agent_class,
             max_steps=env.max_steps,
+            presence=presence,
         )
         return following, (actors, step)
 
@@ -209,6 +251,8 @@ def relive(
     cut = trajectory.last | (trajectory.steps_taken % gap == 0)  # (T, E): after the step
     begins = jnp.roll(cut, 1, axis=0).at[0].set(True)
     pieces = windows(begins, gap)
+    if trajectory.presence is not None and policy.fresh_memory:
+        begins = begins[..., None] | jnp.roll(trajectory.presence.entered, 1, axis=0)
 
     # States too many to list are encoded step by step here as well: as one batch of all that were
     # met they took a quarter longer, as they no longer fit a core's cache.
@@ -220,7 +264,7 @@ def relive(
         return carry, (logits, output.value)
 
     steps = pieces.split((begins, before, noise))
-    beginning = policy.initial_carry(steps[0].shape[1:])
+    beginning = policy.initial_carry(steps[0].shape[1:2])
     _, again = jax.lax.scan(body, beginning, steps, unroll=unroll)
     logits, value = pieces.join(again)
     decisions = {

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args, get_origin
 
 from sumajax.environments.types import Environment
 from sumajax.plain import plain
-from sumajax.policies import hetnet, ic3net, magic
+from sumajax.policies import hetnet, ic3net, magic, tarmac
 from sumajax.policies.types import Decision, Policy, PolicyModule, PolicyOutput, TeamSpec
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
 POLICIES: dict[str, tuple[type[PolicyModule], dict[str, Any]]] = {
     **ic3net.VARIANTS,
     **magic.VARIANTS,
+    **tarmac.VARIANTS,
     **hetnet.VARIANTS,
 }
 """Every named policy: its module and the settings that make it this variant."""

@@ -383,8 +383,8 @@ class HetNet(PolicyModule):
         [N_P / 10, N_A / 10, rows / 20, 1], or `repo`, the published raw numbers.
 
     Raises:
-      ValueError: for a team with other classes or actions than P's 5 and A's 6, or with capture
-        agents that see: their features have no place for it.
+      ValueError: for a team with other classes or actions than P's 5 and A's 6, with capture
+        agents that see (their features have no place for it), or whose agents come and go.
     """
 
     bits: int | None = None
@@ -498,6 +498,11 @@ def _attention_matrix(
 
 
 def _check_team(team: TeamSpec) -> None:
+    if team.agents_leave:
+        raise ValueError(
+            "hetnet has no message for an agent that is not there, and agents of this task come "
+            "and go; use another policy."
+        )
     if list(team.agent_class) != sorted(team.agent_class) or max(team.agent_class) > 1:
         raise ValueError(
             "hetnet is made for predators (class 0) followed by capture agents (class 1), "

@@ -50,12 +50,12 @@ class IC3NetCore(nn.Module):
             self.gate = Dense(2)
 
     def __call__(
-        self, carry: IC3NetCarry, x: chex.Array
+        self, carry: IC3NetCarry, x: chex.Array, alive: chex.Array | None = None
     ) -> tuple[chex.Array, chex.Array, dict[str, chex.Array], chex.Array]:
-        """x (..., N, H) -> h, s, logits by decision, value (..., N)."""
+        """x (..., N, H), alive (..., N) -> h, s, logits by decision, value (..., N)."""
         h, s = carry.h, carry.s
         for message_layer in self.C:
-            h, s = self.lstm((h, s), x + message_layer(mean_message(h, carry.gate)))
+            h, s = self.lstm((h, s), x + message_layer(mean_message(h, carry.gate, alive)))
         if not self.communicates:
             h, s = self.lstm((h, s), x)
         heads = [self.action, self.value, *([self.gate] if self.gated else [])]
@@ -64,25 +64,47 @@ class IC3NetCore(nn.Module):
         return h, s, logits, value[..., 0]
 
 
-def mean_message(h: chex.Array, gate: chex.Array) -> chex.Array:
+def mean_message(h: chex.Array, gate: chex.Array, alive: chex.Array | None = None) -> chex.Array:
     """(..., N, H): what each agent hears, sum over talking others of h / (N - 1).
 
     A silent agent hears nothing either (the published program; the paper's formula gates the sender
-    only), and the mean is over all others, not over those who talk.
+    only), and the mean is over all others who are there, not over those who talk.
     """
-    others = max(h.shape[-2] - 1, 1)
+    gate, others = talking(gate, alive), count_others(gate, alive)
     spoken = gate[..., None] * h
     return gate[..., None] * (spoken.sum(-2, keepdims=True) - spoken) / others
 
 
+def talking(gate: chex.Array, alive: chex.Array | None) -> chex.Array:
+    """(..., N): the gates (..., N), closed for who is not there; `alive` None: all always are."""
+    return gate if alive is None else gate * alive.astype(gate.dtype)
+
+
+def count_others(gate: chex.Array, alive: chex.Array | None) -> chex.Array | int:
+    """How many others an agent has, at least 1: (..., 1, 1), or one number where all always are."""
+    if alive is None:
+        return max(gate.shape[-1] - 1, 1)
+    return jnp.maximum(alive.astype(gate.dtype).sum(-1)[..., None, None] - 1, 1)
+
+
 class IC3Net(PolicyModule):
-    """IC3Net; with `gated=False` CommNet; with `communicates=False` independent controllers."""
+    """IC3Net; with `gated=False` CommNet; with `communicates=False` independent controllers.
+
+    Attributes:
+      comm_passes: rounds of messages within a step.
+      talk_always: the gate is drawn and trained as ever, but taken as open from the second step on,
+        as the published program does in Traffic Junction.
+      fresh_memory: an agent that takes another's place starts without its memory; in the published
+        program it goes on with it.
+    """
 
     hidden: int = 128
     communicates: bool = True
     gated: bool = True
     comm_passes: int = 1
     encoder: EncoderKind = "flat"
+    talk_always: bool = False
+    fresh_memory: bool = False
 
     def setup(self) -> None:
         self.observation = ObservationEncoder(self.hidden, self.encoder)
@@ -97,17 +119,23 @@ class IC3Net(PolicyModule):
         return self.encode_states(states)
 
     def __call__(
-        self, carry: IC3NetCarry, state_features: chex.Array, view: chex.Array, noise: Any
+        self,
+        carry: IC3NetCarry,
+        state_features: chex.Array,
+        view: chex.Array,
+        noise: Any,
+        alive: chex.Array | None = None,
     ) -> tuple[IC3NetCarry, PolicyOutput]:
         x = self.observation(state_features, view, self.team.sighted)
-        talked = carry.gate
-        h, s, logits, value = self.core(carry, x)
+        talked = talking(carry.gate, alive)
+        h, s, logits, value = self.core(carry, x, alive)
         action_logits = mask_actions(logits["action"], self.team)
         decisions: dict[str, Decision] = {"action": decide(action_logits, noise["action"])}
         gate = carry.gate
         if self.gated:
             decisions["gate"] = decide(logits["gate"], noise["gate"])
             gate = decisions["gate"].choice.astype(h.dtype)
+            gate = jnp.ones_like(gate) if self.talk_always else gate
         num_agents = h.shape[-2]
         pairs = talked[..., :, None] * talked[..., None, :]
         pairs = pairs * lift(1 - jnp.eye(num_agents, dtype=pairs.dtype), pairs.ndim)
@@ -115,7 +143,7 @@ class IC3Net(PolicyModule):
             decisions=decisions,
             value=value,
             communication=talked,
-            attention=pairs / max(num_agents - 1, 1),
+            attention=pairs / count_others(talked, alive),
         )
         return IC3NetCarry(h, s, gate), output
 
@@ -138,9 +166,9 @@ class IC3Net(PolicyModule):
 
 VARIANTS = {
     "ic3net": (IC3Net, {}),
-    "commnet": (IC3Net, {"gated": False}),
-    "iric": (IC3Net, {"communicates": False, "gated": False}),
-    "ic": (IC3Net, {"communicates": False, "gated": False}),
+    "commnet": (IC3Net, {"gated": False, "talk_always": False}),
+    "iric": (IC3Net, {"communicates": False, "gated": False, "talk_always": False}),
+    "ic": (IC3Net, {"communicates": False, "gated": False, "talk_always": False}),
 }
 """Names of this file's policies. IC differs from IRIC, and CommNet from IC3Net, also in the reward:
 a team mean, which is a setting of the learner."""

@@ -29,13 +29,15 @@ from sumajax.policies.layers import (
 from sumajax.policies.types import PolicyModule, PolicyOutput, decide, mask_actions
 from sumajax.records import exportable
 
-Setting = Literal["medium", "hard"]
+Setting = Literal["medium", "hard", "complete"]
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "medium": {"encoder_heads": 8, "second_graph": True, "decode_messages": False},
     "hard": {"encoder_heads": 4, "second_graph": False, "decode_messages": True},
+    "complete": {"drawn": False, "second_graph": False, "decode_messages": True},
 }
-"""What differs between the published arguments for 10x10 with 5 agents and 20x20 with 10."""
+"""What differs between the published arguments: 10x10 with 5 agents, 20x20 with 10, and Traffic
+Junction, where no graph is drawn and everybody hears everybody who is there."""
 
 
 @exportable
@@ -90,6 +92,10 @@ class MAGICCore(nn.Module):
     """One step from encoded observations: LSTM, scheduler, two rounds of messages, heads.
 
     Source: algorithms.md 2.1, sizes 2.2.
+
+    Attributes:
+      drawn: whether a scheduler draws who hears whom; without one everybody hears everybody, and
+        the attention is neither normalised nor without the own message.
     """
 
     hidden: int
@@ -101,18 +107,22 @@ class MAGICCore(nn.Module):
     second_heads: int = 1
     second_graph: bool = True
     decode_messages: bool = False
+    drawn: bool = True
 
     def setup(self) -> None:
         hidden, first_width = self.hidden, self.first_heads * self.first_features
         self.lstm = LSTMCell(hidden, hidden)
-        self.gat_enc = GraphAttention(
-            hidden, self.encoder_heads, self.encoder_features, average=True, self_loop="forced"
-        )
-        self.scheduler = Scheduler(self.encoder_features, graphs=2 if self.second_graph else 1)
-        self.gat1 = GraphAttention(hidden, self.first_heads, self.first_features, normalize=True)
-        self.gat2 = GraphAttention(
-            first_width, self.second_heads, hidden, average=True, normalize=True
-        )
+        if self.drawn:
+            self.gat_enc = GraphAttention(
+                hidden, self.encoder_heads, self.encoder_features, average=True, self_loop="forced"
+            )
+            self.scheduler = Scheduler(self.encoder_features, graphs=2 if self.second_graph else 1)
+        graph: dict[str, Any] = {
+            "normalize": self.drawn,
+            "self_loop": "given" if self.drawn else "forced",
+        }
+        self.gat1 = GraphAttention(hidden, self.first_heads, self.first_features, **graph)
+        self.gat2 = GraphAttention(first_width, self.second_heads, hidden, average=True, **graph)
         if self.decode_messages:
             self.decoder = Dense(hidden)
         self.action = Dense(self.num_actions)
@@ -128,48 +138,73 @@ class MAGICCore(nn.Module):
         Args:
           view_kernel: (V, H), which turns what is seen into its share of the encoded observation.
         """
-        return {
-            "lstm": self.lstm.fold(view_kernel),
-            "gat_enc": self.gat_enc.fold(),
-            "gat1": self.gat1.fold(),
-            "gat2": self.gat2.fold(),
-            "scheduler": self.scheduler.fold(),
-        }
+        attention = ("gat_enc", "gat1", "gat2", "scheduler") if self.drawn else ("gat1", "gat2")
+        folded: dict[str, Any] = {"lstm": self.lstm.fold(view_kernel)}
+        return folded | {name: getattr(self, name).fold() for name in attention}
 
     def __call__(
         self,
         carry: MAGICCarry,
         projected: chex.Array,
         seen: chex.Array,
-        graph_noise: chex.Array,
+        graph_noise: chex.Array | None,
         folded: dict[str, Any],
+        alive: chex.Array | None = None,
     ) -> tuple[MAGICCarry, chex.Array, chex.Array, chex.Array, chex.Array]:
         """projected (..., N, 4H), seen (..., N, V), graph_noise (..., Q, N, N) logistic.
 
-        Q is 2, or 1 without a second graph.
+        Q is 2, or 1 without a second graph; without drawn graphs there is no noise. Who is not
+        `alive` (..., N) has no edge, no message of its own, and hears none.
 
         Returns:
           carry, action logits (..., N, num_actions), value (..., N), graphs (..., Q, N, N) 0/1 and
           the first round's attention (..., N, N), the mean over its heads.
         """
         h, s = self.lstm.step_folded((carry.h, carry.s), projected, seen, folded["lstm"])
-        encoded, _ = self.gat_enc(h, folded=folded["gat_enc"])
-        graphs = straight_through_bit(self.scheduler(encoded, folded["scheduler"]), graph_noise)
-        message, weights = self.gat1(h, graphs[..., 0, :, :], folded["gat1"])
+        there = None if alive is None else alive.astype(h.dtype)[..., None]  # (..., N, 1)
+        said = h if there is None else h * there
+        graphs = self._graphs(said, there, graph_noise, folded)
+        message, weights = self.gat1(said, graphs[..., 0, :, :], folded["gat1"])
         message, _ = self.gat2(nn.elu(message), graphs[..., -1, :, :], folded["gat2"])
+        if there is not None:
+            message = message * there
         if self.decode_messages:
             message = self.decoder(message)
         y = jnp.concatenate([h, message], axis=-1)
         action, value = side_by_side([self.action, self.value], y)
         return MAGICCarry(h, s), action, value[..., 0], graphs, weights.mean(-1)
 
+    def _graphs(
+        self,
+        said: chex.Array,
+        there: chex.Array | None,
+        noise: chex.Array | None,
+        folded: dict[str, Any],
+    ) -> chex.Array:
+        """(..., Q, N, N) 0/1: who hears whom, among those who are there."""
+        pairs = None if there is None else there * jnp.swapaxes(there, -1, -2)  # (..., N, N)
+        if not self.drawn:
+            shape = (*said.shape[:-1], said.shape[-2])
+            complete = jnp.ones(shape, said.dtype) if pairs is None else pairs
+            return complete[..., None, :, :]
+        encoded, _ = self.gat_enc(said, pairs, folded["gat_enc"])
+        graphs = straight_through_bit(self.scheduler(encoded, folded["scheduler"]), noise)
+        return graphs if pairs is None else graphs * pairs[..., None, :, :]
+
 
 class MAGIC(PolicyModule):
-    """MAGIC with the published arguments for the medium (10x10) or the hard (20x20) task."""
+    """MAGIC with the published arguments for the medium (10x10) or the hard (20x20) task.
+
+    Attributes:
+      setting: `complete` are the arguments for Traffic Junction, without a scheduler.
+      fresh_memory: an agent that takes another's place starts without its memory; in the published
+        program it goes on with it.
+    """
 
     hidden: int = 128
     setting: Setting = "medium"
     encoder: EncoderKind = "flat"
+    fresh_memory: bool = False
 
     def setup(self) -> None:
         self.observation = ObservationEncoder(self.hidden, self.encoder)
@@ -185,16 +220,21 @@ class MAGIC(PolicyModule):
         return self.core.fold(self.observation.view_kernel())
 
     def __call__(
-        self, carry: MAGICCarry, state_features: chex.Array, view: chex.Array, noise: Any
+        self,
+        carry: MAGICCarry,
+        state_features: chex.Array,
+        view: chex.Array,
+        noise: Any,
+        alive: chex.Array | None = None,
     ) -> tuple[MAGICCarry, PolicyOutput]:
         seen = self.observation.see(view, self.team.sighted)
         carry, logits, value, graphs, attention = self.core(
-            carry, state_features, seen, noise["graph"], self.folded()
+            carry, state_features, seen, noise.get("graph"), self.folded(), alive
         )
         output = PolicyOutput(
             decisions={"action": decide(mask_actions(logits, self.team), noise["action"])},
             value=value,
-            communication=edge_density(graphs),
+            communication=edge_density(graphs, alive),
             attention=attention,
         )
         return carry, output
@@ -204,20 +244,28 @@ class MAGIC(PolicyModule):
         return MAGICCarry(zeros, zeros)
 
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
-        n, graphs = self.team.num_agents, 2 if SETTINGS[self.setting]["second_graph"] else 1
+        n, settings = self.team.num_agents, SETTINGS[self.setting]
+        graphs = 2 if settings["second_graph"] else 1
         action_key, graph_key = jax.random.split(key)
         action_shape = (*batch_shape, n, self.team.num_actions)
-        return {
-            "action": jax.random.gumbel(action_key, action_shape, jnp.float32),
-            "graph": jax.random.logistic(graph_key, (*batch_shape, graphs, n, n), jnp.float32),
-        }
+        noise = {"action": jax.random.gumbel(action_key, action_shape, jnp.float32)}
+        if settings.get("drawn", True):
+            shape = (*batch_shape, graphs, n, n)
+            noise["graph"] = jax.random.logistic(graph_key, shape, jnp.float32)
+        return noise
 
 
-def edge_density(graphs: chex.Array) -> chex.Array:
-    """Graphs (..., Q, N, N) -> (..., N): share of the others that each sender (column) reaches."""
+def edge_density(graphs: chex.Array, alive: chex.Array | None = None) -> chex.Array:
+    """Graphs (..., Q, N, N) -> (..., N): share of the others that each sender (column) reaches.
+
+    The others are those `alive` (..., N), or all.
+    """
     num_agents = graphs.shape[-1]
     to_others = graphs * lift(1 - jnp.eye(num_agents, dtype=graphs.dtype), graphs.ndim)
-    return to_others.sum((-3, -2)) / (graphs.shape[-3] * max(num_agents - 1, 1))
+    others: chex.Array | int = max(num_agents - 1, 1)
+    if alive is not None:
+        others = jnp.maximum(alive.astype(graphs.dtype).sum(-1, keepdims=True) - 1, 1)
+    return to_others.sum((-3, -2)) / (graphs.shape[-3] * others)
 
 
 VARIANTS: dict[str, tuple[type[PolicyModule], dict[str, Any]]] = {"magic": (MAGIC, {})}

@@ -5,6 +5,7 @@ pairs it with the task's shapes and is what users and the learner hold. All para
 the agents of a class and none depends on how many there are: the same parameters act for any N.
 """
 
+import inspect
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import Any, cast
@@ -17,7 +18,7 @@ from flax import linen as nn
 from flax import struct
 
 from sumajax.environments.states import SparseStates, goes_with
-from sumajax.environments.types import Environment, Observation
+from sumajax.environments.types import Environment, Observation, agents_leave
 from sumajax.policies.layers import lift
 from sumajax.precision import stated_precision
 from sumajax.records import exportable
@@ -70,6 +71,7 @@ class TeamSpec:
     action_mask: tuple[tuple[bool, ...], ...]  # (N, num_actions)
     state_shape: tuple[int, int, int]  # (C, rows, columns)
     view_shape: tuple[int, int, int]  # (c, m, m)
+    agents_leave: bool = False  # within an episode; others may take their places
 
     @classmethod
     def of(cls, env: Environment) -> "TeamSpec":
@@ -80,6 +82,7 @@ class TeamSpec:
             action_mask=tuple(tuple(row) for row in env.action_mask.tolist()),
             state_shape=env.state_shape,
             view_shape=env.view_shape,
+            agents_leave=agents_leave(env),
         )
 
     @property
@@ -129,6 +132,9 @@ class PolicyModule(nn.Module, ABC):
           state_features: (..., N, F) rows of `encode_states`.
           view: (..., N, c, m, m).
           noise: from `sample_noise`; all zeros make every choice greedy.
+
+        Where `team.agents_leave`, a step has one more argument, `alive` (..., N) bool: who is not
+        there neither speaks nor hears, whatever else is computed for its place.
         """
 
     @abstractmethod
@@ -143,7 +149,29 @@ class PolicyModule(nn.Module, ABC):
         """`__call__` on the state tensors themselves: the direct path, for any state."""
         flat = jnp.reshape(obs.state, (-1, *obs.state.shape[-3:]))
         features = self.encode_states(flat).reshape(*obs.state.shape[:-3], -1)
-        return self(carry, features, obs.view, noise)
+        return self(carry, features, obs.view, noise, *who_is_there(self, obs.alive))
+
+
+def who_is_there(module: PolicyModule, alive: chex.Array | None) -> tuple[chex.Array, ...]:
+    """`alive` as further arguments of a step: none where nobody ever leaves.
+
+    Raises:
+      ValueError: where agents leave, and nothing says who is there or the module does not ask.
+    """
+    if not module.team.agents_leave:
+        return ()
+    name = type(module).__name__
+    if "alive" not in inspect.signature(type(module).__call__).parameters:
+        raise ValueError(
+            f"agents of this task come and go, but {name} has no argument `alive`; "
+            f"give {name}.__call__ one, (..., N) bool."
+        )
+    if alive is None:
+        raise ValueError(
+            "agents of this task come and go, but nothing says who is there: "
+            "set `alive` of the observation, (..., N) bool."
+        )
+    return (alive,)
 
 
 @dataclass(frozen=True)
@@ -157,6 +185,11 @@ class Policy:
     def team(self) -> TeamSpec:
         return self.module.team
 
+    @property
+    def fresh_memory(self) -> bool:
+        """Whether an agent that takes another's place starts without its memory."""
+        return bool(getattr(self.module, "fresh_memory", False))
+
     def shaped_for(self, env: Environment) -> "Policy":
         """This policy for another task or team, with the same settings; parameters still fit."""
         return Policy(self.name, self.module.clone(team=TeamSpec.of(env)))
@@ -167,6 +200,7 @@ class Policy:
         obs = Observation(
             state=jnp.zeros((team.num_agents, *team.state_shape), jnp.float32),
             view=jnp.zeros((team.num_agents, *team.view_shape), jnp.float32),
+            alive=jnp.ones(team.num_agents, bool) if team.agents_leave else None,
         )
         return self.module.init(
             key,
@@ -217,10 +251,17 @@ class Policy:
 
     @stated_precision
     def step(
-        self, params: Any, carry: Any, state_features: chex.Array, view: chex.Array, noise: Any
+        self,
+        params: Any,
+        carry: Any,
+        state_features: chex.Array,
+        view: chex.Array,
+        noise: Any,
+        alive: chex.Array | None = None,
     ) -> tuple[Any, PolicyOutput]:
         """`apply` with the state already encoded and the random numbers already drawn."""
-        step = self.module.apply(params, carry, state_features, view, noise)
+        there = who_is_there(self.module, alive)
+        step = self.module.apply(params, carry, state_features, view, noise, *there)
         return cast(tuple[Any, PolicyOutput], step)
 
     def sample_noise(

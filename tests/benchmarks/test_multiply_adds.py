@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 from matrix_products import Product, multiply_adds, products, step_products
-from multiply_adds import COUNTS, of_step
+from multiply_adds import COUNTS, of_step, tarmac
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
-from sumajax.policies import POLICIES, make_policy
+from sumajax.policies import POLICIES, TeamSpec, make_policy
 
 PP_SMALL, PP_LARGE = (PredatorPrey(10, n, vision=1, max_steps=200) for n in (3, 5))
 PCP_SMALL, PCP_LARGE = (
@@ -18,6 +18,8 @@ PUBLISHED = [
     ("ic3net", PP_LARGE, 856_000),
     ("magic", PP_SMALL, 691_968),
     ("magic", PP_LARGE, 1_184_640),
+    ("tarmac-ic3net", PP_SMALL, 574_416),
+    ("tarmac-ic3net", PP_LARGE, 958_800),
     ("hetnet", PP_SMALL, 534_976),
     ("hetnet", PP_LARGE, 889_256),
     ("hetnet", PCP_SMALL, 553_684),
@@ -28,6 +30,11 @@ PUBLISHED = [
 @pytest.mark.parametrize(("policy", "env", "count"), PUBLISHED)
 def test_counts_of_the_specification(policy, env, count):
     assert of_step(policy, env) == count
+
+
+@pytest.mark.parametrize(("env", "count"), [(PP_SMALL, 1_079_520), (PP_LARGE, 1_802_080)])
+def test_counts_of_two_rounds(env, count):
+    assert tarmac(TeamSpec.of(env), rounds=2) == count
 
 
 def test_every_policy_has_a_count():
@@ -41,8 +48,21 @@ def test_ic3net_does_what_was_published_less_what_the_table_holds():
     assert done == of_step("ic3net", PP_LARGE) - merge - messages
 
 
+def test_tarmac_does_what_ic3net_does_and_a_little():
+    """Its message layers are folded into the LSTM; scores and weights per pair are all there is."""
+    scores, pairs = 5 * 2 * 128 * 16, 5 * 5 * (16 + 128)
+    ic3net, ours = (
+        multiply_adds(step_products(PP_LARGE, make_policy(name, PP_LARGE), 1))
+        for name in ("ic3net", "tarmac-ic3net")
+    )
+    merge, through_the_lstm = 5 * 32 * 128, 5 * 32 * 512  # what is seen, to H or to 4H
+    c, heard = 5 * 128 * 128, 5 * 128 * 512
+    own = 5 * 128 * 512  # the input of IC3Net's LSTM
+    assert ours - ic3net == scores + pairs + through_the_lstm - merge + heard - c - own
+
+
 @pytest.mark.parametrize("env", [PP_LARGE, PCP_LARGE], ids=["pp", "pcp"])
-@pytest.mark.parametrize("name", ["ic3net", "magic", "hetnet", "hetnet-binary"])
+@pytest.mark.parametrize("name", ["ic3net", "magic", "tarmac-ic3net", "hetnet", "hetnet-binary"])
 def test_products_are_nearly_all_that_the_compiler_counts(name, env):
     """XLA's own analysis adds what is not a product: at most a twentieth."""
     policy, num_envs = make_policy(name, env), 4

@@ -3,7 +3,8 @@
 A recording is one `.npz` file; tests/data/policies/README.md defines its fields and the symbols
 S, T, N, K used here. `answer` gives our value of every `out.*` and `grad.*` field, in the same
 layout, so that a test only compares two arrays.
-Set SUMAJAX_CONFORMANCE_DATA to a directory with a `policies/` folder to answer other files.
+Set SUMAJAX_CONFORMANCE_DATA to a directory with folders `policies/` and `traffic_junction/` (of
+which the files `policy_alive_*` are meant here) to answer other files.
 """
 
 import os
@@ -20,11 +21,16 @@ from sumajax.policies.attention import SELF_LOOPS, GraphAttention
 from sumajax.policies.hetnet import HetGraph, HetNetCarry, HetNetCore
 from sumajax.policies.ic3net import IC3NetCarry, IC3NetCore
 from sumajax.policies.magic import MAGICCarry, MAGICCore
+from sumajax.policies.tarmac import TarMACCore
 
 Arrays = dict[str, Any]
 
 FORCED = 1e4
 """Logistic noise that decides a bit whatever the logits are."""
+
+
+ALIVE = "policy_alive_"
+"""Start of the names of the files where agents come and go."""
 
 
 def directory() -> Path:
@@ -33,7 +39,8 @@ def directory() -> Path:
 
 
 def recordings() -> list[Path]:
-    return sorted(directory().glob("*.npz"))
+    where_agents_leave = (directory().parent / "traffic_junction").glob(f"{ALIVE}*.npz")
+    return [*sorted(directory().glob("*.npz")), *sorted(where_agents_leave)]
 
 
 @lru_cache(maxsize=64)
@@ -67,7 +74,15 @@ def answering(path: Path) -> Callable[[Arrays], Arrays]:
     """The function that answers this kind of file."""
     if path.stem.startswith("magic_") and "cfg.n_cases" in load(path):
         return answer_attention
-    by_prefix = {"ic3net_": answer_ic3net, "magic_": answer_magic, "het_": answer_hetnet}
+    by_prefix = {
+        "ic3net_": answer_ic3net,
+        "magic_": answer_magic,
+        "het_": answer_hetnet,
+        "tarmac_grad_": answer_tarmac_gradient,
+        "tarmac_": answer_tarmac,
+        f"{ALIVE}magic_": answer_magic_alive,
+        ALIVE: answer_ic3net_alive,
+    }
     for prefix, function in by_prefix.items():
         if path.stem.startswith(prefix):
             return function
@@ -90,13 +105,111 @@ def answer_ic3net(fields: Arrays) -> Arrays:
     params = {"params": nested(fields, "param.")}
 
     def step(carry, inputs):
-        x, gate = inputs
-        h, s, logits, value = core.apply(params, IC3NetCarry(*carry, gate), x)
+        x, gate, alive = inputs
+        h, s, logits, value = core.apply(params, IC3NetCarry(*carry, gate), x, alive)
         heads = {f"out.logp_{name}": jax.nn.log_softmax(y) for name, y in logits.items()}
         return (h, s), {"out.h": h, "out.s": s, "out.value": value, **heads}
 
+    start, alive = jnp.zeros_like(x[:, 0]), fields.get("in.alive")
+    return unroll(step, (start, start), (x, gate, alive), fields["in.reset"])
+
+
+def answer_ic3net_alive(fields: Arrays) -> Arrays:
+    """`policy_alive_*` of the IC3Net family: one pass, an alive mask besides."""
+    return answer_ic3net(fields | {"cfg.comm": 1, "cfg.comm_layer": 1, "cfg.comm_passes": 1})
+
+
+def answer_tarmac(fields: Arrays) -> Arrays:
+    """README_tarmac.md section 1."""
+    return tarmac_outputs(fields, nested(fields, "param."), fields["in.x"])
+
+
+def answer_tarmac_gradient(fields: Arrays) -> Arrays:
+    """`tarmac_grad_*`: derivatives of a weighted sum of the outputs, through all steps."""
+
+    def weighed(params: Arrays, x: jax.Array) -> tuple[jax.Array, Arrays]:
+        out = tarmac_outputs(fields, params, x)
+        named = {"action": "out.logp_action", "gate": "out.logp_gate", "value": "out.value"}
+        given = {k: v for k, v in named.items() if f"in.cot_{k}" in fields}
+        return sum((fields[f"in.cot_{k}"] * out[v]).sum() for k, v in given.items()), out
+
+    run = jax.jit(jax.value_and_grad(weighed, (0, 1), has_aux=True))
+    (scalar, out), (params, x) = run(nested(fields, "param."), fields["in.x"])
+    return out | dotted(params, "grad.") | {"grad.x": x, "out.scalar": scalar}
+
+
+def tarmac_outputs(fields: Arrays, params: Arrays, x: jax.Array) -> Arrays:
+    """What TarMAC with these parameters makes of x (S, T, N, H)."""
+    gated = bool(fields["cfg.gated"])
+    core = TarMACCore(
+        hidden=x.shape[-1],
+        num_actions=params["action"]["bias"].shape[0],
+        gated=gated,
+        comm_passes=int(fields["cfg.comm_passes"]),
+    )
+    if not fields["cfg.comm"]:  # what is said is made of nothing, so of the biases alone
+        silent = {k: params[k] | {"kernel": 0 * params[k]["kernel"]} for k in SAID}
+        params = params | silent
+    params = {"params": params}
+    folded = core.apply(params, jnp.zeros((0, x.shape[-1]), x.dtype), method=core.fold)
+    gate = jnp.asarray(fields["in.gate"] if gated else np.ones(x.shape[:3]), x.dtype)
+
+    def step(carry, inputs):
+        x, gate, alive = inputs
+        projected = core.apply(params, x, method=core.project_input)
+        h, s, logits, value, attention = core.apply(
+            params, IC3NetCarry(*carry, gate), projected, x[..., :0], folded, alive
+        )
+        heads = {f"out.logp_{name}": jax.nn.log_softmax(y) for name, y in logits.items()}
+        out = {"out.h": h, "out.s": s, "out.value": value, "out.attention": attention}
+        return (h, s), out | heads
+
+    start, alive = jnp.zeros_like(x[:, 0]), fields.get("in.alive")
+    return unroll(step, (start, start), (x, gate, alive), fields["in.reset"])
+
+
+SAID = ("query", "key", "message")
+"""The layers of TarMAC that read the memory that is said, or compared with it."""
+
+
+def answer_magic_alive(fields: Arrays) -> Arrays:
+    """`policy_alive_magic_*`: complete graphs among the living, as published for the domain."""
+    x = fields["in.x"]
+    heads, features = fields["param.gat1.a_i"].shape
+    core = MAGICCore(
+        hidden=x.shape[-1],
+        num_actions=fields["param.action.bias"].shape[0],
+        first_heads=heads,
+        first_features=features,
+        second_heads=fields["param.gat2.a_i"].shape[0],
+        second_graph=False,
+        decode_messages=True,
+        drawn=False,
+    )
+    params = {"params": nested(fields, "param.")}
+    folded = core.apply(params, jnp.zeros((0, x.shape[-1]), x.dtype), method=core.fold)
+
+    def step(carry, inputs):
+        x, alive = inputs
+        projected = core.apply(params, x, method=core.project_input)
+        (carry, logits, value, *_), caught = core.apply(
+            params,
+            carry,
+            projected,
+            x[..., :0],
+            None,
+            folded,
+            alive,
+            capture_intermediates=True,
+        )
+        layer = returned(caught["intermediates"])
+        out = {"out.h": carry.h, "out.s": carry.s, "out.value": value}
+        out |= {"out.logp_action": jax.nn.log_softmax(logits), "out.decoded": layer["decoder"]}
+        out |= {"out.gat1": layer["gat1"][0], "out.gat2": layer["gat2"][0]}
+        return carry, out
+
     start = jnp.zeros_like(x[:, 0])
-    return unroll(step, (start, start), (x, gate), fields["in.reset"])
+    return unroll(step, MAGICCarry(start, start), (x, fields["in.alive"]), fields["in.reset"])
 
 
 def answer_magic(fields: Arrays) -> Arrays:
@@ -299,6 +412,12 @@ def nested(fields: Arrays, prefix: str) -> Arrays:
                 branch = branch.setdefault(part, {})
             branch[leaf] = value
     return tree
+
+
+def dotted(tree: Any, prefix: str) -> Arrays:
+    """{"lstm": {"w_ih": y}} -> {prefix + "lstm.w_ih": y}, the inverse of `nested`."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {prefix + ".".join(key.key for key in path): leaf for path, leaf in leaves}
 
 
 def magic_parameters(fields: Arrays, rounds: int) -> Arrays:

@@ -1,9 +1,9 @@
-"""Whole updates of the original IC3Net program against `Learner.update`, every field of `a2c_*`.
+"""Whole updates of the original programs against `Learner.update`, every field of `a2c_*`.
 
 A recorded batch becomes a task of one environment whose rewards, ends and encoded observations are
 those of the file, and the recorded choices are forced on the policy by its noise. What is compared
 then comes out of the learner itself: rollout, loss, gradient, RMSprop step.
-tests/data/policies/README.md, section 4, defines the fields.
+tests/data/policies/README.md, section 4, and README_tarmac.md define the fields.
 """
 
 import re
@@ -20,12 +20,14 @@ import numpy as np
 import policy_data as data
 import pytest
 from flax import linen as nn
+from flax import struct
 
 from sumajax.environments.types import Observation, Transition
 from sumajax.learning import LearnerConfig, losses, optimiser, preset, returns
 from sumajax.learning.learner import Learner, TrainState
 from sumajax.learning.rollout import Actors, Draws, last_value, rollout
 from sumajax.policies.ic3net import IC3Net, IC3NetCore
+from sumajax.policies.tarmac import TarMAC, TarMACCore
 from sumajax.policies.types import Policy, TeamSpec
 
 Arrays = dict[str, Any]
@@ -41,15 +43,30 @@ each_recording = pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: pa
 each_precision = pytest.mark.parametrize("dtype", DTYPES.values(), ids=DTYPES)
 
 
+@struct.dataclass
+class RecordedState:
+    """Before a step."""
+
+    row: chex.Array  # () int32 number of the step
+    alive: chex.Array  # (N,) bool: who is there
+
+
 @dataclass(frozen=True, eq=False)
 class RecordedEpisodes:
-    """The steps of all recorded episodes, one after the other; a state is the number of a row."""
+    """The steps of all recorded episodes, one after the other."""
 
     reward: np.ndarray  # (rows, N)
     last: np.ndarray  # (rows,) 0 or 1
     t: np.ndarray  # (rows,) step number within the episode
     max_steps: int
     num_actions: int
+    # (rows, N) 0 or 1, where agents come and go: who is there after a step, who left with it
+    counted: np.ndarray | None = None
+    completed: np.ndarray | None = None
+
+    @property
+    def agents_leave(self) -> bool:
+        return self.counted is not None
 
     @property
     def num_agents(self) -> int:
@@ -66,31 +83,39 @@ class RecordedEpisodes:
     state_shape = view_shape = (1, 1, 1)
     sighted_classes = (True,)
 
-    def step(self, row: chex.Array, actions: chex.Array) -> tuple[chex.Array, Transition]:
+    def step(self, state: RecordedState, actions: chex.Array) -> tuple[RecordedState, Transition]:
+        row, alive, left = state.row, state.alive, None
         last, time = jnp.asarray(self.last)[row] == 1, jnp.asarray(self.t)[row] + 1
+        if self.agents_leave:
+            alive = jnp.asarray(self.counted)[row] == 1
+            left = jnp.asarray(self.completed)[row] == 1
         transition = Transition(
             reward=jnp.asarray(self.reward)[row],
             terminated=last & (time != self.max_steps),
             truncated=last & (time == self.max_steps),
             success=last & (time != self.max_steps),
             steps_taken=time,
+            left=left,
         )
-        return row + 1, transition
+        return RecordedState(row + 1, alive), transition
 
-    def view(self, row: chex.Array) -> chex.Array:
+    def view(self, state: RecordedState) -> chex.Array:
         return jnp.zeros((self.num_agents, *self.view_shape))
 
-    def state_index(self, row: chex.Array) -> chex.Array:
-        return row * self.num_agents + jnp.arange(self.num_agents)
+    def state_index(self, state: RecordedState) -> chex.Array:
+        return state.row * self.num_agents + jnp.arange(self.num_agents)
 
     def state_table(self) -> chex.Array:
         return jnp.zeros((self.reward.size, *self.state_shape))
 
-    def observe(self, row: chex.Array) -> Observation:
-        return Observation(jnp.zeros((self.num_agents, *self.state_shape)), self.view(row))
+    def observe(self, state: RecordedState) -> Observation:
+        return Observation(jnp.zeros((self.num_agents, *self.state_shape)), self.view(state))
 
-    def active(self, row: chex.Array) -> chex.Array:
+    def active(self, state: RecordedState) -> chex.Array:
         return jnp.ones(self.num_agents, bool)
+
+    def alive(self, state: RecordedState) -> chex.Array:
+        return state.alive
 
 
 class RecordedEncoder(nn.Module):
@@ -107,6 +132,13 @@ class RecordedEncoder(nn.Module):
     def __call__(self, features: chex.Array, view: chex.Array, sighted: Any) -> chex.Array:
         return features
 
+    def see(self, view: chex.Array, sighted: Any) -> chex.Array:
+        """Nothing: all is in the features."""
+        return jnp.zeros((*view.shape[:-3], 0), self.x.dtype)
+
+    def view_kernel(self) -> chex.Array:
+        return jnp.zeros((0, self.shape[-1]), self.x.dtype)
+
 
 class RecordedIC3Net(IC3Net):
     """IC3Net after its encoder."""
@@ -118,6 +150,16 @@ class RecordedIC3Net(IC3Net):
         self.core = IC3NetCore(
             self.hidden, self.team.num_actions, self.communicates, self.gated, self.comm_passes
         )
+
+
+class RecordedTarMAC(TarMAC):
+    """TarMAC after its encoder."""
+
+    rows: int = 0
+
+    def setup(self) -> None:
+        self.observation = RecordedEncoder((self.rows, self.team.num_agents, self.hidden))
+        self.core = TarMACCore(self.hidden, self.team.num_actions, self.gated, self.comm_passes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,16 +194,20 @@ def recorded_task(fields: Arrays, updates: list[Arrays]) -> tuple[RecordedEpisod
         max_steps=int(fields["cfg.max_steps"]),
         num_actions=fields["p0.action.bias"].shape[0],
     )
+    if fields.get("cfg.masks"):
+        env = replace(env, counted=rows("in.counted"), completed=rows("in.completed"))
     passes = sum(k.startswith("p0.C_") and k.endswith(".kernel") for k in fields)
-    module = RecordedIC3Net(
-        team=TeamSpec.of(env),
-        hidden=fields["p0.lstm.w_hh"].shape[0],
-        gated=bool(fields["cfg.gated"]),
-        communicates=passes > 0,
-        comm_passes=passes,
-        rows=len(env.reward),
-    )
-    return env, Policy("ic3net", module)
+    shared = {
+        "team": TeamSpec.of(env),
+        "hidden": fields["p0.lstm.w_hh"].shape[0],
+        "gated": bool(fields["cfg.gated"]),
+        "comm_passes": passes,
+        "talk_always": bool(fields.get("cfg.talk_always", 0)),
+        "rows": len(env.reward),
+    }
+    if "p0.query.kernel" in fields:
+        return env, Policy("tarmac", RecordedTarMAC(**shared))
+    return env, Policy("ic3net", RecordedIC3Net(communicates=passes > 0, **shared))
 
 
 def settings(fields: Arrays) -> LearnerConfig:
@@ -181,7 +227,9 @@ def settings(fields: Arrays) -> LearnerConfig:
 def recorded_inputs(policy: Policy, update: Arrays, first: int, dtype: Any) -> tuple[Actors, Draws]:
     """Where the update at row `first` starts, and the noise that forces its choices."""
     n, num_agents = update["in.action"].shape
-    rows = first + jnp.arange(n)[:, None]
+    alive = update.get("in.alive", np.ones((n, num_agents))) == 1
+    states = RecordedState(first + jnp.arange(n)[:, None], jnp.asarray(alive)[:, None])
+    following = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), states)
     widths = {"action": policy.team.num_actions, "gate": 2}
     chosen = {"action": update["in.action"], "gate": update.get("in.gate_action")}
     noise = {
@@ -190,8 +238,9 @@ def recorded_inputs(policy: Policy, update: Arrays, first: int, dtype: Any) -> t
         if choice is not None
     }
     carry = jax.tree.map(lambda c: c.astype(dtype), policy.initial_carry((1,)))
-    start = Actors(rows[0], carry, jnp.zeros((1, num_agents), dtype))
-    return start, Draws(noise=noise, fresh=rows + 1)
+    first_state = jax.tree.map(lambda x: x[0], states)
+    start = Actors(first_state, carry, jnp.zeros((1, num_agents), dtype))
+    return start, Draws(noise=noise, fresh=following)
 
 
 def batch_results(learner: RecordedLearner, params: Any) -> Arrays:
@@ -201,8 +250,7 @@ def batch_results(learner: RecordedLearner, params: Any) -> Arrays:
     beyond = last_value(env, policy, params, actors)
     valid = jnp.ones(trajectory.last.shape, bool)
     loss, parts = losses.actor_critic(trajectory, valid, beyond, config, 1.0)
-    individual = losses.estimate_advantages(trajectory, beyond, config) + trajectory.value
-    target = returns.mix_team(individual, config.team_reward)
+    target = losses.estimate_returns(trajectory, beyond, config)
     decisions = trajectory.decisions
     by_step = {
         "out.value": trajectory.value,
@@ -220,14 +268,8 @@ def update_results(learner: RecordedLearner, state: TrainState) -> tuple[TrainSt
     results = batch_results(learner, state.params)
     next_state, tally = learner.update(state.replace(actors=learner.given[0]))
     grads = jax.tree.map(lambda g: g / tally.env_steps, learner.gradients.pop()["params"])
-    results |= dotted(grads["core"], "grad.") | {"grad.x": grads["observation"]["x"]}
+    results |= data.dotted(grads["core"], "grad.") | {"grad.x": grads["observation"]["x"]}
     return next_state.replace(actors=None), results
-
-
-def dotted(tree: Any, prefix: str) -> Arrays:
-    """{"lstm": {"w_ih": y}} -> {prefix + "lstm.w_ih": y}, the inverse of `policy_data.nested`."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {prefix + ".".join(key.key for key in path): leaf for path, leaf in leaves}
 
 
 @lru_cache(maxsize=16)
@@ -263,7 +305,7 @@ def answer_updates(fields: Arrays, dtype: Any) -> Arrays:
         state, answers = jax.jit(partial(update_results, learner))(state)
         answers["grad.x"] = answers["grad.x"][first:end]
         results |= {f"u{k}.{name}": y for name, y in answers.items()}
-        results |= dotted(state.params["params"]["core"], f"p{k}.")
+        results |= data.dotted(state.params["params"]["core"], f"p{k}.")
         first = end
     return results
 
@@ -305,6 +347,7 @@ def test_returns_by_their_definition(path):
         for k in range(1, int(fields["cfg.n_updates"]) + 1):
             update = part(fields, k)
             ongoing = np.broadcast_to(1 - update["in.last"][:, None], update["in.reward"].shape)
+            ongoing = ongoing * (1 - update.get("in.completed", 0))
             individual = returns.discounted_returns(
                 jnp.asarray(update["in.reward"]),
                 jnp.asarray(fields["cfg.gamma"] * ongoing),
@@ -322,5 +365,7 @@ def test_the_recorded_gates_were_used(path):
         update = part(fields, k)
         if "in.gate" in update:
             before = np.roll(update["in.gate_action"], 1, axis=0)
+            if fields.get("cfg.talk_always"):
+                before = np.ones_like(before)
             used = np.where(update["in.reset"][:, None], 0, before)
             np.testing.assert_array_equal(used, update["in.gate"])

@@ -12,7 +12,8 @@ import pytest
 from sumajax.policies.layers import straight_through_bit
 
 OF_THE_LEARNER = "a2c_"
-PREFIXES = ("ic3net_", "magic_", "het_", OF_THE_LEARNER)
+OF_POLICIES = ("ic3net_", "magic_", "het_", "tarmac_", data.ALIVE)
+PREFIXES = (*OF_POLICIES, OF_THE_LEARNER)
 TOLERANCE = {np.float64: 1e-9, np.float32: 1e-5}
 RAW_META_TOLERANCE = 1e-4
 """float32 in `het_seq_*`, whose state nodes read raw numbers up to 500 (README section 3.3)."""
@@ -33,7 +34,7 @@ each_precision = pytest.mark.parametrize(
 
 def test_there_are_recordings_of_every_policy():
     stems = [path.stem for path in data.recordings()]
-    for prefix in ("ic3net_", "magic_", "het_"):
+    for prefix in OF_POLICIES:
         assert any(stem.startswith(prefix) for stem in stems), f"no {prefix}* in {data.directory()}"
 
 

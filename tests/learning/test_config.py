@@ -20,6 +20,7 @@ PUBLISHED = {
     "team_reward": 0.0,
     "advantages": "raw",
     "mask_inactive": False,
+    "alive_mask": "after",
     "loss": "actor_critic",
     "value_weight": 0.01,
     "policy_weight": 1.0,
@@ -51,6 +52,8 @@ DIFFERENT = {
     "commnet": {"team_reward": 1.0},
     "ic": {"team_reward": 1.0},
     "magic": {"value_weight": 0.015},
+    "tarmac": {"team_reward": 1.0},
+    "tarmac-ic3net": {},
     "hetnet": HETNET,
     "hetnet-binary": HETNET,
 }
@@ -70,8 +73,9 @@ def test_an_epoch_of_the_paper_is_ten_updates():
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_preset_fast_differs_only_in_the_reward(policy):
-    """CommNet and IC are trained on the team's mean, IRIC on its own (algorithms.md 1.2)."""
-    team = {"commnet": 1.0, "ic": 1.0, "iric": 0.0}.get(policy, LearnerConfig().team_reward)
+    """CommNet, IC and TarMAC without a gate are trained on the team's mean, IRIC on its own."""
+    of_team = {"commnet": 1.0, "ic": 1.0, "tarmac": 1.0, "iric": 0.0}
+    team = of_team.get(policy, LearnerConfig().team_reward)
     assert preset("fast", policy) == LearnerConfig(team_reward=team)
 
 

@@ -18,7 +18,14 @@ PREY_FIVE = PredatorPrey(size=4, num_predators=5)
 CAPTURE_THREE = PredatorCapturePrey(size=4, num_predators=2, num_capturers=1)
 CAPTURE_FIVE = PredatorCapturePrey(size=4, num_predators=3, num_capturers=2)
 
-NAMES = ("ic3net", "magic", "hetnet", "hetnet-binary")
+
+class ComeAndGo(PredatorPrey):
+    """Predator-Prey for policies to act in while some of the agents are not there."""
+
+    agents_leave = True
+
+
+NAMES = ("ic3net", "magic", "tarmac-ic3net", "hetnet", "hetnet-binary")
 """The policies that differ in more than what their team says to each other."""
 
 
@@ -46,7 +53,9 @@ def greedy(policy: Policy, batch_shape: tuple[int, ...] = ()) -> Any:
     return policy.greedy_noise(batch_shape)
 
 
-def observe(env: Any, seed: int, batch_shape: tuple[int, ...] = ()) -> Observation:
+def observe(
+    env: Any, seed: int, batch_shape: tuple[int, ...] = (), alive: Any = None
+) -> Observation:
     """Agents on random cells that see random things; blind agents see nothing, as in the task."""
     random = np.random.default_rng(seed)
     shape = (*batch_shape, env.num_agents)
@@ -56,6 +65,7 @@ def observe(env: Any, seed: int, batch_shape: tuple[int, ...] = ()) -> Observati
     return Observation(
         state=table[random.integers(len(table), size=shape)],
         view=np.where(sighted[:, None, None, None], view, np.float32(0)),
+        alive=None if alive is None else np.asarray(alive, bool),
     )
 
 

@@ -140,6 +140,20 @@ def test_published_settings(setting, graphs, heads, decodes):
     assert greedy(policy)["graph"].shape == (graphs, 3, 3)
 
 
+def test_published_for_agents_that_come_and_go():
+    """Everybody hears everybody: nothing is drawn, and there is no scheduler."""
+    policy = make_policy("magic", PREY_THREE, setting="complete")
+    core = shapes(policy)["params"]["core"]
+    assert not {"scheduler", "gat_enc"} & set(core)
+    assert core["decoder"]["kernel"] == (128, 128)
+    assert "graph" not in greedy(policy)
+    _, output = stepper(policy)(
+        parameters(policy), policy.initial_carry(), observe(PREY_THREE, 0), greedy(policy)
+    )
+    np.testing.assert_array_equal(output.communication, [1, 1, 1])
+    assert (output.attention > 0).all()
+
+
 def test_size_is_the_specified_one():
     policy = make_policy("magic", PredatorPrey(size=10, num_predators=5))
     assert size(policy) == 278_026

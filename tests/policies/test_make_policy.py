@@ -9,22 +9,29 @@ from .teams import NAMES, PREY_THREE
 
 
 def test_every_published_policy_has_a_name():
-    assert set(POLICIES) == {*NAMES, "commnet", "iric", "ic"}
+    assert set(POLICIES) == {*NAMES, "commnet", "iric", "ic", "tarmac"}
 
 
 def test_an_unknown_name_is_answered_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"'tarmac' is unknown; choose one of ic3net, .*magic"):
-        make_policy("tarmac", PREY_THREE)
+    with pytest.raises(ValueError, match=r"'dgn' is unknown; choose one of ic3net, .*magic"):
+        make_policy("dgn", PREY_THREE)
 
 
 def test_an_unknown_setting_is_answered_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"no setting 'layers'; it has encoder, hidden, setting"):
+    with pytest.raises(
+        ValueError, match=r"no setting 'layers'; it has encoder, fresh_memory, hidden, setting"
+    ):
         make_policy("magic", PREY_THREE, layers=3)
 
 
 @pytest.mark.parametrize(
     ("name", "settings"),
-    [("ic3net", {"encoder": "deep"}), ("magic", {"setting": "easy"}), ("hetnet", {"meta": "raw"})],
+    [
+        ("ic3net", {"encoder": "deep"}),
+        ("magic", {"setting": "easy"}),
+        ("hetnet", {"meta": "raw"}),
+        ("tarmac", {"score_scale": "none"}),
+    ],
 )
 def test_an_unknown_choice_is_answered_with_the_known_ones(name, settings):
     ((setting, value),) = settings.items()
