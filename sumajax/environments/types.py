@@ -20,6 +20,7 @@ class Observation:
 
     state: chex.Array  # (N, C, rows, columns) float32: the agent's own cell, one-hot (or upsampled)
     view: chex.Array  # (N, c, m, m) float32: entity counts around the agent, -1 outside the grid
+    alive: chex.Array | None = None  # (N,) bool, needed where agents leave; None: all are there
 
 
 @exportable
@@ -32,6 +33,7 @@ class Transition:
     truncated: chex.Array  # () bool: not done, and the step limit is reached or passed
     success: chex.Array  # () bool: the completion condition holds after this step, in every mode
     steps_taken: chex.Array  # () int32: steps of this episode so far, this one included
+    left: chex.Array | None = None  # (N,) bool: went for good with this step; None: nobody does
 
 
 @runtime_checkable
@@ -106,3 +108,16 @@ class Environment(Protocol):
 
     def active(self, state: Any) -> chex.Array:
         """(N,) bool: agents whose next action can still change anything."""
+
+    def alive(self, state: Any) -> chex.Array:
+        """(N,) bool: agents that are in the task now; who is not sees, does and says nothing.
+
+        Read only where the task says that agents come and go, by a constant `agents_leave = True`.
+        Such a task also fills in `Observation.alive` and `Transition.left`; an agent that is alive
+        after a step in which its place was left is another one.
+        """
+
+
+def agents_leave(env: Environment) -> bool:
+    """Whether agents come and go within an episode of `env`; a task that does not say: no."""
+    return bool(getattr(env, "agents_leave", False))
