@@ -13,7 +13,6 @@ from functools import partial
 from typing import ClassVar, Literal, get_args
 
 import chex
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct

@@ -249,15 +249,16 @@ def draw_arrivals(
     Args:
       alive: (N,) bool: slots that hold a car before any of these enters.
     """
-    num_entries = len(env.roads.entries)
-    bits = jax.random.bits(key, (3, num_entries), jnp.uint32)
+    num_entries, num_routes = env.roads.first_places.shape
+    bits = jax.random.bits(key, (2, num_entries), jnp.uint32)
     wanted = bits[0].astype(jnp.float32) * np.float32(2.0**-32) <= rate
     earlier = jnp.stack([wanted[:g].sum(dtype=jnp.uint32) for g in range(num_entries)])
     empty = (~alive).sum(dtype=jnp.uint32)
     happens = wanted & (earlier < empty)
-    # How many are left for this one, and which of them it takes.
+    # How many are left for this one; and one draw of which of them it takes, and of its route.
     left = jnp.where(happens, empty - earlier, 1)
-    draw = grid.scale_to_range(bits[1], left)
+    pair = grid.scale_to_range(bits[1], left * np.uint32(num_routes))
+    draw, choice = pair // num_routes, pair % num_routes
     # Whoever takes an empty slot leaves the last of those left in its place (Fisher and Yates).
     # Nothing is swapped here: walking back over the earlier draws finds the slot.
     which, order = draw, np.arange(num_entries)
@@ -267,7 +268,6 @@ def draw_arrivals(
     # The slot with `which` empty ones before it.
     up_to = jnp.cumsum(~alive, dtype=jnp.uint32)
     slot = (up_to <= which[:, None]).sum(-1, dtype=jnp.int32)
-    choice = grid.scale_to_range(bits[2], np.uint32(env.roads.routes_per_entry))
     return Arrivals(happens=happens, slot=slot, choice=choice.astype(jnp.int32))
 
 
@@ -292,13 +292,15 @@ def view(env: TrafficJunction, state: State) -> chex.Array:
     Cars are counted, the own one included. What is no road and what is no grid look alike, as in
     the original. An empty slot reads zeros.
     """
+    alive = state.alive[:, None, None]
     lines = jnp.asarray(env.roads.lines(env.vision))[state.place]
     road = lines[:, 0, :, None] * lines[:, 1, None] > 1
     cell = jnp.asarray(env.roads.cell)[state.place]
     cars = grid.window_count(cell, cell[None], env.vision)[:, 0]
     last_action = jnp.broadcast_to(state.last_action[:, None, None], road.shape)
-    seen = jnp.stack([road, cars, ~road, last_action], axis=1)
-    return jnp.where(state.alive[:, None, None, None], seen, 0).astype(jnp.float32)
+    channels = [road, jnp.where(alive, cars, 0), ~road & alive, jnp.where(alive, last_action, 0)]
+    # Of one type before they are put together: XLA's CPU code then copies whole windows.
+    return jnp.stack([channel.astype(jnp.float32) for channel in channels], axis=1)
 
 
 def state_index(env: TrafficJunction, state: State) -> chex.Array:
