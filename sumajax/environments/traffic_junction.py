@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.typing import ArrayLike
 
 from sumajax.environments import grid
 from sumajax.environments.actions import checked_actions
@@ -181,7 +182,7 @@ class TrafficJunction:
     def collided(self, state: State) -> chex.Array:
         return collided(self, state)
 
-    def rates(self, epochs: int) -> np.ndarray:
+    def rates(self, epochs: ArrayLike) -> np.ndarray:
         return rates(self, epochs)
 
 
@@ -314,23 +315,32 @@ def collided(env: TrafficJunction, state: State) -> chex.Array:
     return ((cell[:, None] == cell).sum(-1) > 1) & state.alive
 
 
-def rates(env: TrafficJunction, epochs: int) -> np.ndarray:
-    """(epochs,) float64 arrival rate in each epoch of training, counted from 0.
+def rates(env: TrafficJunction, epochs: ArrayLike) -> np.ndarray:
+    """(E,) float64 arrival rate of training epochs, in the order in which they are trained.
 
-    A rate that rises does so by equal parts in every epoch of `rate_epochs` but epoch 0, and is
-    rounded down to hundredths by float division, as in the original: 0.3 becomes 0.29.
+    A rate that rises is rounded down to hundredths by float division, as in the original: 0.3
+    becomes 0.29.
+
+    Args:
+      epochs: (E,) int, counted from 0; `np.arange(E)` for a whole run.
     """
-    first, end = env.rate_epochs
-    last = env.final_arrival_rate
-    if last is None or last <= env.arrival_rate or end <= first:
-        return np.full(epochs, env.arrival_rate)
-    exact, rate, table = env.arrival_rate, env.arrival_rate, []
-    for epoch in range(epochs):
-        if epoch > 0 and first <= epoch < end:
-            exact += (last - env.arrival_rate) / (end - first)
-            rate = RATE_STEP * (exact // RATE_STEP)
-        table.append(rate)
-    return np.array(table)
+    exact = exact_rates(env, epochs)
+    return np.where(exact > env.arrival_rate, RATE_STEP * (exact // RATE_STEP), exact)
+
+
+def exact_rates(env: TrafficJunction, epochs: ArrayLike) -> np.ndarray:
+    """(E,) float64: `rates` before rounding.
+
+    Each epoch of `rate_epochs` adds an equal part when it is first reached; epoch 0 adds none. The
+    parts are added one after another, as in the original.
+    """
+    (start, end), first = env.rate_epochs, env.arrival_rate
+    last = first if env.final_arrival_rate is None else env.final_arrival_rate
+    epochs = np.asarray(epochs)
+    reached = np.maximum.accumulate(np.concatenate([[0], epochs]))[:-1]
+    rises = (epochs > reached) & (start <= epochs) & (epochs < end) & (last > first)
+    parts = np.where(rises, (last - first) / max(end - start, 1), 0.0)
+    return np.cumsum(np.concatenate([[first], parts]))[1:]
 
 
 def flat_observation(
