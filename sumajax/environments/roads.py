@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from sumajax.environments.grid import DOWN, LEFT, NOWHERE, RIGHT, UP
+from sumajax.environments.states import SparseStates
 
 Difficulty = Literal["easy", "medium", "hard"]
 
@@ -132,28 +133,27 @@ class Roads:
 
     @property
     def state_row(self) -> np.ndarray:
-        """(P,) int32: the row of `state_table` that is each place's."""
+        """(P,) int32: the entry of `states` that is each place's."""
         return self._rows[1]
 
-    @property
-    def num_states(self) -> int:
-        """S, different state tensors. Where routes have joined, their places share one."""
-        return len(self._rows[0])
-
     @cached_property
-    def state_table(self) -> np.ndarray:
-        """(S, 2, d, d) float32: own cell one-hot, and all cells ahead; zeros where there is no car.
+    def states(self) -> SparseStates:
+        """The S state tensors (2, d, d): own cell, and all cells ahead; zeros where there is no car.
 
         The way ahead is a set of cells, but with the own cell it has one order only: no route meets
-        a cell twice.
+        a cell twice. Where routes have joined, their places share a tensor.
         """
-        table = np.zeros((self.num_states, 2, *self.shape), np.float32)
-        for tensor, place in zip(table, self._rows[0], strict=True):
+        side = self.layout.side
+        longest = max(map(len, self.routes))
+        cell = np.zeros((len(self._rows[0]), longest), np.int32)
+        value = np.zeros(cell.shape, np.float32)
+        for state, place in enumerate(self._rows[0]):
             if not self.ended[place]:
-                own, *ahead = self.routes[self.route[place]][self.position[place] :].tolist()
-                tensor[0, *own] = 1
-                tensor[1, *np.reshape(ahead, (-1, 2)).astype(int).T] = 1
-        return table
+                row, column = self.routes[self.route[place]][self.position[place] :].T
+                channel = np.arange(len(row)) > 0
+                cell[state, : len(row)] = (channel * side + row) * side + column
+                value[state, : len(row)] = 1
+        return SparseStates(cell, value, (2, side, side))
 
     @cached_property
     def padded_routes(self) -> np.ndarray:

@@ -26,6 +26,7 @@ from jax.typing import ArrayLike
 from sumajax.environments import grid
 from sumajax.environments.actions import checked_actions
 from sumajax.environments.roads import Difficulty, Roads, roads
+from sumajax.environments.states import SparseStates
 from sumajax.environments.types import Observation, Transition
 
 WAIT_REWARD = -0.01
@@ -39,7 +40,8 @@ RATE_STEP = 0.01
 """A rate that rises is rounded down to a multiple of this."""
 
 MAX_TABLE = 10_000_000
-"""Numbers in a table of state tensors; a hard junction of side 54 still has one."""
+"""Numbers in a table of state tensors: beyond a hard junction of side 54 they are listed sparsely
+alone."""
 
 MAX_STEPS = 2**31 - 1
 """Steps are counted in int32."""
@@ -170,8 +172,12 @@ class TrafficJunction:
         return state_index(self, state)
 
     def state_table(self) -> np.ndarray | None:
-        numbers = self.roads.num_states * math.prod(self.state_shape)
-        return self.roads.state_table if numbers <= MAX_TABLE else None
+        states = self.roads.states
+        fits = len(states) * math.prod(self.state_shape) <= MAX_TABLE
+        return states.dense() if fits else None
+
+    def sparse_states(self) -> SparseStates:
+        return self.roads.states
 
     def active(self, state: State) -> chex.Array:
         return state.alive
