@@ -138,7 +138,7 @@ class Roads:
 
     @cached_property
     def states(self) -> SparseStates:
-        """The S state tensors (2, d, d): own cell, and all cells ahead; zeros where there is no car.
+        """The S state tensors (2, d, d): own cell, and all cells ahead; 0 where there is no car.
 
         The way ahead is a set of cells, but with the own cell it has one order only: no route meets
         a cell twice. Where routes have joined, their places share a tensor.
