@@ -80,6 +80,7 @@ class PredatorCapturePrey:
     capture_reward: CaptureReward = "default"
     capture_vision: int | None = None
 
+    class_names: ClassVar[tuple[str, ...]] = ("predators", "capturers")
     entities: ClassVar[tuple[str, ...]] = ("predators", "capturers", "prey")
     num_actions: ClassVar[int] = 6
 

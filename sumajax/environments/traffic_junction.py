@@ -28,6 +28,8 @@ from sumajax.environments.actions import checked_actions
 from sumajax.environments.roads import Difficulty, Roads, roads
 from sumajax.environments.states import SparseStates
 from sumajax.environments.types import Observation, Transition
+from sumajax.plain import plain_fields
+from sumajax.records import exportable
 
 WAIT_REWARD = -0.01
 """Per car and step, times the steps since it entered (the original's TIMESTEP_PENALTY)."""
@@ -50,6 +52,7 @@ Vocabulary = Literal["bool", "scalar"]
 """How the originals' flat observation names a cell: by one entry of many, or by its two numbers."""
 
 
+@exportable
 @struct.dataclass
 class State:
     """One episode in progress. N slots; G entries."""
@@ -64,6 +67,7 @@ class State:
     key: chex.PRNGKey  # () the arrivals still to be drawn
 
 
+@exportable
 @struct.dataclass
 class Arrivals:
     """The cars that want to enter in one step, by entry, in the order in which they are let in."""
@@ -105,15 +109,19 @@ class TrafficJunction:
     rate_epochs: tuple[int, int] = (250, 1250)
     reset_last_action: bool = False
 
+    class_names: ClassVar[tuple[str, ...]] = ("cars",)
     channels: ClassVar[tuple[str, ...]] = ("road", "cars", "outside", "last action")
     num_actions: ClassVar[int] = 2
     agents_leave: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        plain_fields(self)
         _one_of("difficulty", self.difficulty, get_args(Difficulty))
         for name, value in PUBLISHED[self.difficulty].items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
+        if isinstance(self.rate_epochs, list):  # as JSON has it
+            object.__setattr__(self, "rate_epochs", tuple(self.rate_epochs))
         _validate(self)
 
     @property
@@ -443,7 +451,7 @@ def _validate(env: TrafficJunction) -> None:
     least_values = {"size": 1, "num_cars": 2, "vision": 0, "max_steps": 1}
     for name, least in least_values.items():
         value = getattr(env, name)
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        if isinstance(value, bool) or not isinstance(value, int):
             raise ValueError(f"{name} must be a whole number, got {value!r}.")
         if value < least:
             raise ValueError(f"{name} must be at least {least}, got {value}.")
@@ -465,9 +473,10 @@ def _validate(env: TrafficJunction) -> None:
         rate = getattr(env, name)
         if name == "final_arrival_rate" and rate is None:
             continue
-        number = isinstance(rate, (int, float, np.number)) and not isinstance(rate, bool)
+        number = isinstance(rate, (int, float)) and not isinstance(rate, bool)
         if not number or not 0 <= rate <= 1:
             raise ValueError(f"{name} is a chance between 0 and 1, got {rate!r}.")
     epochs = env.rate_epochs
-    if len(epochs) != 2 or not all(isinstance(epoch, (int, np.integer)) for epoch in epochs):
+    pair = isinstance(epochs, tuple) and len(epochs) == 2
+    if not pair or not all(isinstance(epoch, int) for epoch in epochs):
         raise ValueError(f"rate_epochs are two whole numbers, first and end, got {epochs!r}.")
