@@ -30,7 +30,8 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
+from sumajax.environments.roads import Difficulty
 from sumajax.environments.types import Environment
 
 Rollout = Callable[[Any, chex.PRNGKey], tuple[Any, chex.Array]]
@@ -46,10 +47,12 @@ class Options:
     """Predators, one number per size."""
     capturers: int = 0
     """Capture agents beside them; 0 is Predator-Prey."""
+    junctions: tuple[Difficulty, ...] = ()
+    """Traffic Junctions at their published sizes, to be stepped instead of these grids."""
     vision: int = 1
     """How many cells an agent sees in each direction."""
     max_steps: int = 200
-    """Step limit of an episode."""
+    """Step limit of an episode on the grids."""
     environments: tuple[int, ...] = (64, 256, 1024)
     """Numbers of environments side by side."""
     steps: int = 64
@@ -93,13 +96,20 @@ class Result:
     steps_per_second: Rates
 
 
-def make_env(size: int, num_predators: int, options: Options) -> PredatorCapturePrey:
+def make_envs(options: Options) -> list[Environment]:
+    """The junctions asked for, or else the grids."""
     vision, max_steps = options.vision, options.max_steps
+    if options.junctions:
+        return [TrafficJunction(difficulty, vision=vision) for difficulty in options.junctions]
+    teams = list(zip(options.sizes, options.predators, strict=True))
     if options.capturers == 0:
-        return PredatorPrey(size, num_predators, vision=vision, max_steps=max_steps)
-    return PredatorCapturePrey(
-        size, num_predators, options.capturers, vision=vision, max_steps=max_steps
-    )
+        return [
+            PredatorPrey(size, count, vision=vision, max_steps=max_steps) for size, count in teams
+        ]
+    return [
+        PredatorCapturePrey(size, count, options.capturers, vision=vision, max_steps=max_steps)
+        for size, count in teams
+    ]
 
 
 def make_rollout(env: Environment, options: Options, num_envs: int) -> Rollout:
@@ -170,8 +180,7 @@ def spread(rates: list[float]) -> Rates:
 def main(options: Options) -> None:
     print("million environment steps per second: median (least .. most) of the repeats")
     results = []
-    for size, num_predators in zip(options.sizes, options.predators, strict=True):
-        env = make_env(size, num_predators, options)
+    for env in make_envs(options):
         print(env)
         for num_envs in options.environments:
             result = measure(env, options, num_envs)

@@ -1,7 +1,7 @@
 """Multi-agent reinforcement learning scaled by state upsampling, as one compiled JAX program."""
 
 from sumajax.checkpoint import load, save
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
 from sumajax.evaluation import evaluate, load_agent
 from sumajax.learning import LearnerConfig, make_learner, preset
 from sumajax.policies import make_policy
@@ -14,6 +14,7 @@ __all__ = [
     "PredatorCapturePrey",
     "PredatorPrey",
     "StateUpsampled",
+    "TrafficJunction",
     "evaluate",
     "load",
     "load_agent",

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from flax import linen as nn
 
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
 from sumajax.environments.types import Environment
 from sumajax.plain import is_values, plain
 from sumajax.policies import POLICIES, Policy, make_policy
@@ -39,7 +39,8 @@ _BUILD_IT = (
 )
 
 TASKS: dict[str, type] = {
-    cls.__name__: cls for cls in (PredatorPrey, PredatorCapturePrey, StateUpsampled)
+    cls.__name__: cls
+    for cls in (PredatorPrey, PredatorCapturePrey, TrafficJunction, StateUpsampled)
 }
 """Every task `rebuild` may make, by the name a description calls it."""
 

@@ -11,7 +11,7 @@ import pytest
 from refusals import refusal
 
 from sumajax.description import check_compatible, describe, rebuild, versions
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
 from sumajax.policies import POLICIES, Policy, TeamSpec, make_policy
 from sumajax.policies.ic3net import IC3Net
 from sumajax.upsampling import StateUpsampled
@@ -19,6 +19,7 @@ from sumajax.upsampling import StateUpsampled
 ENVS = [
     PredatorPrey(size=5, num_predators=3, vision=1, max_steps=80, reward_mode="cooperative"),
     PredatorPrey(size=(4, 6), vision=0),
+    TrafficJunction("medium", final_arrival_rate=0.3, rate_epochs=(2, 5)),
     PredatorCapturePrey(size=6, num_capturers=2, vision=2, capture_vision=1),
     StateUpsampled(PredatorPrey(size=5), size=10, scale="mass"),
     StateUpsampled(StateUpsampled(PredatorPrey(size=(2, 3)), size=(4, 6)), size=(8, 12)),

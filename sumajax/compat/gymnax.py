@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sumajax.environments.types import Environment, Observation
+from sumajax.environments.types import Environment, Observation, agents_leave
 from sumajax.environments.wrapper import unwrapped
 
 if importlib.util.find_spec("gymnax") is not None:
@@ -125,12 +125,13 @@ class AutoReset:
         """A space for each field of `Observation`."""
         shapes = {"state": self.env.state_shape, "view": self.env.view_shape}
         bounds = {"state": (0.0, 1.0), "view": (-1.0, float(self.env.num_agents + 1))}
-        return spaces.Dict(
-            {
-                name: spaces.Box(*bounds[name], (self.env.num_agents, *shape), jnp.float32)
-                for name, shape in shapes.items()
-            }
-        )
+        boxes = {
+            name: spaces.Box(*bounds[name], (self.env.num_agents, *shape), jnp.float32)
+            for name, shape in shapes.items()
+        }
+        if agents_leave(self.env):
+            boxes["alive"] = spaces.Box(0, 1, (self.env.num_agents,), jnp.bool_)
+        return spaces.Dict(boxes)
 
     def action_space(self, params: EnvParams | None = None) -> Any:
         """One choice per agent; `env.action_mask` tells the ones that mean something."""

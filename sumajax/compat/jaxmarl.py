@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
 from sumajax.environments.types import Environment
 from sumajax.environments.wrapper import unwrapped
 from sumajax.records import exportable
@@ -35,9 +35,10 @@ else:
 
     Base = object
 
-TASKS: dict[str, type[PredatorCapturePrey]] = {
+TASKS: dict[str, type[Any]] = {
     "sumajax_predator_prey": PredatorPrey,
     "sumajax_predator_capture_prey": PredatorCapturePrey,
+    "sumajax_traffic_junction": TrafficJunction,
 }
 """Names for `make`."""
 
@@ -95,7 +96,7 @@ class JaxMARLEnv(Base):
     @property
     def agent_classes(self) -> dict[str, list[str]]:
         """The names of each class's agents."""
-        names = ("predators", "capturers")
+        names = getattr(self.task, "class_names", ())
         groups: dict[str, list[str]] = {}
         for agent, kind in zip(self.agents, self.task.agent_class, strict=True):
             name = names[kind] if kind < len(names) else f"class_{kind}"

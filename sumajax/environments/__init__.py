@@ -3,6 +3,7 @@
 from sumajax.environments.predator_capture_prey import PredatorCapturePrey
 from sumajax.environments.predator_prey import PredatorPrey
 from sumajax.environments.states import SparseStates
+from sumajax.environments.traffic_junction import TrafficJunction
 from sumajax.environments.types import Environment, Observation, Transition
 from sumajax.environments.wrapper import Wrapper, rewrapped, unwrapped
 
@@ -12,6 +13,7 @@ __all__ = [
     "PredatorCapturePrey",
     "PredatorPrey",
     "SparseStates",
+    "TrafficJunction",
     "Transition",
     "Wrapper",
     "rewrapped",

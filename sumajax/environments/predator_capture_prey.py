@@ -13,13 +13,13 @@ from functools import partial
 from typing import ClassVar, Literal, get_args
 
 import chex
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.typing import ArrayLike
 
 from sumajax.environments import grid
+from sumajax.environments.actions import checked_actions, is_traced
 from sumajax.environments.states import SparseStates, one_hot_states
 from sumajax.environments.types import Observation, Transition
 from sumajax.plain import plain_fields
@@ -80,6 +80,7 @@ class PredatorCapturePrey:
     capture_reward: CaptureReward = "default"
     capture_vision: int | None = None
 
+    class_names: ClassVar[tuple[str, ...]] = ("predators", "capturers")
     entities: ClassVar[tuple[str, ...]] = ("predators", "capturers", "prey")
     num_actions: ClassVar[int] = 6
 
@@ -175,7 +176,7 @@ def state_at(env: PredatorCapturePrey, agents: ArrayLike, prey: ArrayLike) -> St
             f"state_at needs agents of shape ({env.num_agents}, 2) and prey of shape (2,), "
             f"got {agents.shape} and {prey.shape}."
         )
-    if not _is_traced(agents, prey):
+    if not is_traced(agents, prey):
         for name, cells in (("agent", np.asarray(agents)), ("prey", np.asarray(prey)[None])):
             outside = (cells < 0).any(-1) | (cells >= np.array(env.shape)).any(-1)
             if outside.any():
@@ -202,7 +203,7 @@ def step(env: PredatorCapturePrey, state: State, actions: chex.Array) -> tuple[S
     Raises:
       ValueError: for a concrete action out of range, a wrong shape or no whole numbers.
     """
-    actions = _checked_actions(env, actions)
+    actions = checked_actions(env, actions)
     was_on_prey = (state.agents == state.prey[None]).all(-1)
     captured = state.captured | (was_on_prey & (actions == grid.CAPTURE))
     moved = grid.move(state.agents, actions, env.shape)
@@ -295,28 +296,6 @@ def _reward(env: PredatorCapturePrey, on_prey: chex.Array, captured: chex.Array)
     waiting = NEAR_CAPTURE_REWARD if env.capture_reward == "second" else STEP_REWARD
     reward = jnp.where(on_prey, jnp.where(captured, paid_on_prey, waiting), STEP_REWARD)
     return reward.astype(jnp.float32)
-
-
-def _is_traced(*arrays: chex.Array) -> bool:
-    return any(isinstance(array, jax.core.Tracer) for array in arrays)
-
-
-def _checked_actions(env: PredatorCapturePrey, actions: chex.Array) -> chex.Array:
-    actions = jnp.asarray(actions)
-    if actions.shape != (env.num_agents,):
-        raise ValueError(
-            f"step needs one action per agent, shape ({env.num_agents},), got {actions.shape}."
-        )
-    if not jnp.issubdtype(actions.dtype, jnp.integer):
-        raise ValueError(f"actions are whole numbers, got an array of {actions.dtype}.")
-    if not _is_traced(actions):
-        wrong = (np.asarray(actions) < 0) | (np.asarray(actions) >= env.num_actions)
-        if wrong.any():
-            raise ValueError(
-                f"action {np.asarray(actions)[wrong][0]} of agent {int(wrong.argmax())} is not one "
-                f"of the {env.num_actions} actions 0..{env.num_actions - 1}."
-            )
-    return actions
 
 
 def _validate(env: PredatorCapturePrey) -> None:

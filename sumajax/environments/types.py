@@ -33,7 +33,7 @@ class Transition:
     truncated: chex.Array  # () bool: not done, and the step limit is reached or passed
     success: chex.Array  # () bool: the completion condition holds after this step, in every mode
     steps_taken: chex.Array  # () int32: steps of this episode so far, this one included
-    left: chex.Array | None = None  # (N,) bool: went with this step; None: nobody ever does
+    left: chex.Array | None = None  # (N,) bool: went for good with this step; None: nobody does
 
 
 @runtime_checkable

@@ -7,7 +7,7 @@ import pytest
 
 from sumajax.compat import spaces as own_spaces
 from sumajax.compat.gymnax import AutoReset
-from sumajax.environments import PredatorPrey
+from sumajax.environments import PredatorPrey, TrafficJunction
 from sumajax.upsampling import StateUpsampled
 
 TASK = PredatorPrey(size=3, num_predators=2, max_steps=3)
@@ -107,6 +107,23 @@ def test_spaces():
     ENV.step(jax.random.key(0), state, actions)
     assert ENV.default_params.max_steps_in_episode == 3
     assert (ENV.name, ENV.num_actions) == ("PredatorPrey", 5)
+
+
+def test_a_task_whose_agents_come_and_go():
+    """Who is there is part of what is seen, and the key in the state goes on to draw who comes."""
+    junction = AutoReset(TrafficJunction(num_cars=3, max_steps=4, arrival_rate=0.5))
+    obs, state = junction.reset(jax.random.key(0))
+    there = []
+    for time in range(5):
+        assert junction.observation_space().contains(obs)
+        result = junction.step(jax.random.key(time), state, jnp.zeros(3, jnp.int32))
+        obs, state, _, terminated, truncated, info = result
+        assert not terminated
+        assert bool(truncated) == (time == 3)
+        there.append(np.asarray(info["final_observation"].alive))
+        np.testing.assert_array_equal(obs.alive, state.alive)
+    assert np.any(there)
+    assert int(state.time) == 1  # of the next episode
 
 
 def test_our_own_spaces():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sumajax.compat import jaxmarl as compat
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
 from sumajax.upsampling import StateUpsampled
 
 PP = PredatorPrey(size=3, num_predators=2, max_steps=4)
@@ -177,6 +177,33 @@ class TestAvailableActions:
         assert not env.get_avail_actions(state)["agent_0"][5]
         results = [env.step(jax.random.key(1), state, a) for a in (capture, stays(env))]
         jax.tree.map(np.testing.assert_array_equal, *results)
+
+
+class TestTrafficJunction:
+    """Agents that come and go: who is not there sees zeros and is paid nothing."""
+
+    def test_an_episode(self):
+        env = compat.make("sumajax_traffic_junction", num_cars=3, max_steps=4, arrival_rate=0.5)
+        assert env.task == TrafficJunction(num_cars=3, max_steps=4, arrival_rate=0.5)
+        assert env.agent_classes == {"cars": env.agents}
+        obs, state = env.reset(jax.random.key(0))
+        came = []
+        for time in range(4):
+            gas = dict.fromkeys(env.agents, jnp.int32(0))
+            obs, state, rewards, dones, _ = env.step(jax.random.key(time), state, gas)
+            alive = np.asarray(env.task.alive(state.env_state))
+            for agent, there in zip(env.agents, alive, strict=True):
+                assert env.observation_space(agent).contains(obs[agent])
+                assert bool(obs[agent].any()) == there
+                assert there or dones["__all__"] or float(rewards[agent]) == 0
+            came.append(alive)
+            assert bool(dones["__all__"]) == (time == 3)
+        assert np.any(came)
+
+    def test_upsampled(self):
+        env = compat.make("sumajax_traffic_junction", upsample_to=14)
+        assert env.name == "TrafficJunction"
+        assert env.observation_space("agent_0").shape == (2 * 14 * 14 + 4 * 9,)
 
 
 class TestMake:

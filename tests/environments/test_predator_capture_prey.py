@@ -113,6 +113,7 @@ class TestCapture:
         states, _ = play(env, start(env), [ARRIVE, BOTH_CAPTURE])
         active = [env.active(state).tolist() for state in states]
         assert active == [[True, True], [False, True], [False, False]]
+        assert all(env.alive(state).all() for state in states)  # they are still there
 
 
 class TestEnd:

@@ -9,11 +9,15 @@ from sumajax.reporting.replay.pictures import (
     write_strip,
 )
 from sumajax.reporting.replay.recording import Episode, Recording, record, record_episode
+from sumajax.reporting.replay.traffic_episode import TrafficEpisode
+from sumajax.reporting.replay.traffic_marks import car_spots, traffic_caption
 
 __all__ = [
     "Episode",
     "Recording",
+    "TrafficEpisode",
     "caption",
+    "car_spots",
     "draw_frame",
     "frame_artists",
     "messages",
@@ -23,6 +27,7 @@ __all__ = [
     "spots",
     "strip_figure",
     "strip_moments",
+    "traffic_caption",
     "write_gif",
     "write_strip",
 ]

@@ -1,6 +1,7 @@
 """What is drawn of a moment of an episode, as matplotlib artists; lengths are in cells."""
 
 from collections.abc import Iterator
+from functools import singledispatch
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from matplotlib.text import Text
 
 from sumajax.environments.grid import DOWN, LEFT, RIGHT, UP, window_offsets
 from sumajax.reporting.replay.recording import CAPTURER, PREDATOR, Episode
+from sumajax.reporting.replay.traffic_episode import TrafficEpisode
 
 # Okabe and Ito's palette; classes differ by shape as well.
 AGENT_COLOURS = ("#0072B2", "#D55E00")
@@ -33,12 +35,19 @@ MIN_WEIGHT = 1e-3
 STEPS = {UP: (-1, 0), RIGHT: (0, 1), DOWN: (1, 0), LEFT: (0, -1)}
 
 
-def frame_artists(episode: Episode, moment: int, cell_points: float) -> list[Artist]:
+@singledispatch
+def frame_artists(episode: Any, moment: int, cell_points: float) -> list[Artist]:
     """What a frame shows beside the grid, in the order it is drawn.
 
     Args:
+      episode: of a kind that is registered here: another domain's marks are their own file.
       cell_points: side of a cell in points, for the size of the numbers.
     """
+    raise TypeError(f"no marks for an episode of type {type(episode).__name__}.")
+
+
+@frame_artists.register
+def _(episode: Episode, moment: int, cell_points: float) -> list[Artist]:
     places, radius = spots(episode.agents[moment])
     # Whoever stands on the prey stands in front of it: its tips still show.
     occupied = (episode.agents[moment] == episode.prey[moment]).all(-1).any()
@@ -49,10 +58,10 @@ def frame_artists(episode: Episode, moment: int, cell_points: float) -> list[Art
     ]
     if moment < episode.num_steps:
         artists += [
-            *_messages(episode, moment, places, radius),
+            *message_arrows(episode, moment, places, radius),
             *_moves(episode, moment, places, radius),
         ]
-        artists += _gates(episode.communication[moment], places, radius)
+        artists += gates(episode.communication[moment], places, radius)
     for agent in range(episode.num_agents):
         artists += _agent(episode, moment, agent, places[agent], float(radius[agent]), cell_points)
     return sorted(artists, key=Artist.get_zorder)
@@ -92,7 +101,7 @@ def spots(agents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return centres, radii
 
 
-def messages(episode: Episode, moment: int) -> list[tuple[int, int, float]]:
+def messages(episode: Episode | TrafficEpisode, moment: int) -> list[tuple[int, int, float]]:
     """(sender, receiver, weight) of every message of a step; nobody sends to itself."""
     weights = np.asarray(episode.attention[moment])
     return [
@@ -153,8 +162,8 @@ def _prey(prey: np.ndarray, radius: float) -> Iterator[Artist]:
     yield Polygon(corners, facecolor=PREY_COLOUR, edgecolor=INK, linewidth=0.8, zorder=3)
 
 
-def _messages(
-    episode: Episode, moment: int, places: np.ndarray, radius: np.ndarray
+def message_arrows(
+    episode: Episode | TrafficEpisode, moment: int, places: np.ndarray, radius: np.ndarray
 ) -> Iterator[Artist]:
     """Arrows from senders to receivers, as strong as the attention."""
     strongest = max(float(np.max(episode.attention, initial=0)), MIN_WEIGHT)
@@ -184,7 +193,7 @@ def _messages(
         yield arrow
 
 
-def _gates(shares: np.ndarray, places: np.ndarray, radius: np.ndarray) -> Iterator[Artist]:
+def gates(shares: np.ndarray, places: np.ndarray, radius: np.ndarray) -> Iterator[Artist]:
     """A ring around every agent that talks; the fainter, the less of its means it uses."""
     for agent, share in enumerate(shares):
         if share > MIN_WEIGHT:
@@ -267,8 +276,14 @@ def _badge(agent: int, x: float, y: float, size: float) -> Iterator[Artist]:
     yield Line2D(x + tick[:, 0], y + tick[:, 1], color="white", linewidth=1.0, zorder=9)
 
 
-def legend_marks(episode: Episode) -> list[Artist]:
+@singledispatch
+def legend_marks(episode: Any) -> list[Artist]:
     """What the marks mean, as far as they occur."""
+    raise TypeError(f"no marks for an episode of type {type(episode).__name__}.")
+
+
+@legend_marks.register
+def _(episode: Episode) -> list[Artist]:
 
     def mark(marker: str, label: str, **style: Any) -> Line2D:
         return Line2D([], [], linestyle="", marker=marker, markersize=8, label=label, **style)

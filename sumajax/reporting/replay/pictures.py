@@ -14,12 +14,17 @@ from PIL import Image
 from sumajax.reporting.metrics import write_bytes
 from sumajax.reporting.replay.marks import FAINT, INK, frame_artists, legend_marks
 from sumajax.reporting.replay.recording import Episode
+from sumajax.reporting.replay.traffic_episode import TrafficEpisode
+
+AnyEpisode = Episode | TrafficEpisode
 
 STRIP_INCHES = 9.0
 DPI = 100
 
 
-def write_gif(episode: Episode, path: str | Path, *, seconds_per_step: float | None = None) -> None:
+def write_gif(
+    episode: AnyEpisode, path: str | Path, *, seconds_per_step: float | None = None
+) -> None:
     """Writes an animated GIF of T + 1 frames, the last one held, repeating for ever.
 
     Args:
@@ -44,7 +49,7 @@ def write_gif(episode: Episode, path: str | Path, *, seconds_per_step: float | N
     write_bytes(path, content.getvalue())
 
 
-def write_strip(episode: Episode, path: str | Path, frames: int = 6) -> None:
+def write_strip(episode: AnyEpisode, path: str | Path, frames: int = 6) -> None:
     """Writes a PNG of `frames` moments spread over the episode, first and last among them.
 
     The picture is 1800 pixels wide and meant to be read at half that; large grids stand in fewer
@@ -66,7 +71,7 @@ def strip_moments(num_steps: int, frames: int) -> list[int]:
     return sorted({round(moment) for moment in np.linspace(num_steps, 0, frames)})
 
 
-def strip_figure(episode: Episode, moments: Sequence[int]) -> Figure:
+def strip_figure(episode: AnyEpisode, moments: Sequence[int]) -> Figure:
     """A figure with a panel for each of `moments` and one legend."""
     rows, columns = episode.size
     across = min(len(moments), max(2, int(STRIP_INCHES * DPI / (26 * columns))))
@@ -88,20 +93,20 @@ def strip_figure(episode: Episode, moments: Sequence[int]) -> Figure:
     return figure
 
 
-def draw_frame(axes: Axes, episode: Episode, moment: int) -> None:
+def draw_frame(axes: Axes, episode: AnyEpisode, moment: int) -> None:
     """Draws frame `moment` in 0..T into `axes`; lengths are in cells, so it scales with them."""
     _draw_grid(axes, episode.size)
     for artist in frame_artists(episode, moment, _cell_points(axes)):
         axes.add_artist(artist)
 
 
-def _frame_inches(episode: Episode) -> tuple[float, float]:
+def _frame_inches(episode: AnyEpisode) -> tuple[float, float]:
     rows, columns = episode.size
     cell = float(np.clip(5.2 / max(rows, columns), 0.32, 0.72))
     return max(columns * cell + 0.2, 4.2), rows * cell + 1.0
 
 
-def _frames(episode: Episode, figure: Figure) -> Iterator[np.ndarray]:
+def _frames(episode: AnyEpisode, figure: Figure) -> Iterator[np.ndarray]:
     """(height, width, 3) uint8 of every frame, drawn on one figure after another."""
     canvas = FigureCanvasAgg(figure)
     width, height = figure.get_size_inches()
@@ -154,7 +159,7 @@ def _cell_points(axes: Axes) -> float:
     return abs(float(one[0] - origin[0])) * 72 / (figure.dpi if figure is not None else DPI)
 
 
-def _add_legend(figure: Figure, episode: Episode, across: int) -> None:
+def _add_legend(figure: Figure, episode: AnyEpisode, across: int) -> None:
     figure.legend(
         handles=legend_marks(episode),
         loc="lower center",

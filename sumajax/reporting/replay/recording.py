@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sumajax.environments.traffic_junction import TrafficJunction
 from sumajax.environments.types import Environment
 from sumajax.environments.wrapper import unwrapped
 from sumajax.policies.types import Policy
+from sumajax.reporting.replay.traffic_episode import TrafficEpisode
 
 PREDATOR, CAPTURER = 0, 1
 
@@ -76,11 +78,11 @@ class Episode:
 
 def record_episode(
     env: Environment, policy: Policy, params: Any, key: chex.PRNGKey, greedy: bool = False
-) -> Episode:
+) -> Episode | TrafficEpisode:
     """Runs one episode to its end and keeps what a replay needs.
 
     Args:
-      env: Predator-Prey, Predator-Capture-Prey, or one of them upsampled.
+      env: Predator-Prey, Predator-Capture-Prey, Traffic Junction, or one of them upsampled.
       greedy: take the likeliest choice everywhere instead of sampling.
 
     Raises:
@@ -88,6 +90,10 @@ def record_episode(
         shaped for another task.
     """
     task = unwrapped(env)  # a wrapper changes what is observed, not the grid
+    if isinstance(task, TrafficJunction):
+        seen = record(env, policy, params, key, greedy)
+        said = (seen.actions, seen.attention, seen.communication)
+        return TrafficEpisode.of(task, seen.states, *said, seen.success)
     state = jax.eval_shape(task.reset, key)
     if not all(hasattr(state, name) for name in ("agents", "prey", "reached", "captured")):
         raise ValueError(
