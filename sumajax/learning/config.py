@@ -45,8 +45,14 @@ class LearnerConfig:
       optimiser, learning_rate: Adam, or RMSprop as the originals set it.
       transfer_rate: the learning rate after a transfer, as a share of `learning_rate`: what the
         source has learnt is to be bent, not to be learnt anew.
+      scale_by_size: after a transfer, rate and weights follow the size of the task, and the critic
+        learns alone first (`scaling.after_transfer`).
       max_grad_norm: clip of the gradient's global norm; None is no clipping.
       clip_per_env: clip each environment's gradient alone before they are added, as processes do.
+      critic_epochs: so long at the start the critic alone learns, at `critic_rate`: only parameters
+        that no decision depends on change, so a policy brought from elsewhere stays as it is until
+        its critic knows the task.
+      critic_rate: the learning rate of that time.
       warmup_epochs: the learning rate rises linearly from 0 over this many epochs.
       anneal_epochs: learning rate and entropy weight fall linearly to `anneal_to` of their start
         over this many epochs; 0 keeps them constant; None: over the whole stage, whose length
@@ -75,8 +81,11 @@ class LearnerConfig:
     optimiser: Optimiser = "adam"
     learning_rate: float = 1.5e-3
     transfer_rate: float = 0.5
+    scale_by_size: bool = True
     max_grad_norm: float | None = 0.5
     clip_per_env: bool = False
+    critic_epochs: int = 0
+    critic_rate: float = 1.5e-3
     warmup_epochs: int = 0
     anneal_epochs: int | None = None
     anneal_to: float = 0.02
@@ -124,6 +133,7 @@ _PUBLISHED: dict[str, Any] = {
     "optimiser": "rmsprop",
     "learning_rate": 1e-3,
     "transfer_rate": 1.0,
+    "scale_by_size": False,
     "max_grad_norm": None,
     "anneal_epochs": 0,
     "detach_gap": 10,
@@ -192,6 +202,7 @@ _OPTIONAL = ("max_grad_norm", "anneal_epochs", "detach_gap")
 _LEAST: dict[str, int] = {
     "num_envs": 1,
     "rollout_length": 1,
+    "critic_epochs": 0,
     "warmup_epochs": 0,
     "anneal_epochs": 0,
     "detach_gap": 1,
@@ -211,11 +222,18 @@ _NUMBERS: dict[str, tuple[Callable[[float], bool], str]] = {
     "policy_weight": _WEIGHT,
     "entropy_weight": _WEIGHT,
     "learning_rate": _POSITIVE,
+    "critic_rate": _POSITIVE,
     "max_grad_norm": _POSITIVE,
 }
 """What a number must be, as a test and in words."""
 
-_SWITCHES = ("whole_episodes", "bootstrap_timeouts", "mask_inactive", "clip_per_env")
+_SWITCHES = (
+    "whole_episodes",
+    "bootstrap_timeouts",
+    "mask_inactive",
+    "scale_by_size",
+    "clip_per_env",
+)
 
 
 def _validate(config: LearnerConfig) -> None:

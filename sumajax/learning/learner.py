@@ -18,7 +18,16 @@ from sumajax.learning.config import LearnerConfig
 from sumajax.learning.hetnet_loss import hetnet
 from sumajax.learning.losses import LossFunction, LossParts, actor_critic
 from sumajax.learning.optimiser import annealed, learning_rate, make_optimiser
-from sumajax.learning.rollout import Actors, Draws, Trajectory, draw, last_value, rollout, start
+from sumajax.learning.rollout import (
+    Actors,
+    Draws,
+    Trajectory,
+    draw,
+    last_value,
+    rollout,
+    stagger,
+    start,
+)
 from sumajax.policies.types import Policy
 from sumajax.precision import stated_precision
 
@@ -155,12 +164,20 @@ class Learner:
         return self.init_from(self.policy.init(params_key), train_key)
 
     def init_from(self, params: Any, key: chex.PRNGKey, opt_state: Any = None) -> TrainState:
-        """The start of training from given parameters, and from optimiser memory if given."""
+        """The start of training from given parameters, and from optimiser memory if given.
+
+        The environments are at staggered ages, unless every update starts them afresh.
+        """
         fresh = make_optimiser(self.config).init(params)
+        keys = self._keys(key, jnp.int32(START))
+        actors = start(self.env, self.policy, keys)
+        if not self.config.whole_episodes:
+            ahead = jax.vmap(partial(jax.random.fold_in, data=0))(keys)
+            actors = stagger(self.env, self.policy, params, actors, ahead)
         return TrainState(
             params=params,
             opt_state=fresh if opt_state is None else opt_state,
-            actors=start(self.env, self.policy, self._keys(key, jnp.int32(START))),
+            actors=actors,
             key=key,
             updates=jnp.int32(0),
         )
@@ -189,9 +206,10 @@ class Learner:
         grads = jax.tree.map(lambda g: g / tally.env_steps.astype(g.dtype), grads)
         tally = replace(tally, gradient_norm=optax.tree.norm(grads), updates=jnp.int32(1))
         optimiser = make_optimiser(self.config)
+        grads, opt_state = self._critic_alone(grads, state)
         # Its own arithmetic mixes whole numbers and floats, which a program may have forbidden.
         with jax.numpy_dtype_promotion("standard"):
-            direction, opt_state = optimiser.update(grads, state.opt_state, state.params)
+            direction, opt_state = optimiser.update(grads, opt_state, state.params)
         rate = learning_rate(self.config, state.updates)
         params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
         loss = tally.loss.policy + tally.loss.value + tally.loss.entropy
@@ -254,6 +272,22 @@ class Learner:
             self.axis,
         )
         return loss, (jax.lax.stop_gradient(actors), tally_of(trajectory, valid, parts))
+
+    def _critic_alone(self, grads: Any, state: TrainState) -> tuple[Any, Any]:
+        """Gradient and optimiser memory of an update: in the first `critic_epochs` nothing for what
+        the policy depends on, and after them no memory of that time.
+        """
+        if not self.config.critic_epochs:
+            return grads, state.opt_state
+        alone = self.config.critic_epochs * self.config.updates_per_epoch
+        grads = jax.tree.map(
+            lambda g, critic: g if critic else jnp.where(state.updates < alone, 0.0, g),
+            grads,
+            self.policy.only_critic(grads),
+        )
+        fresh = make_optimiser(self.config).init(state.params)
+        first = state.updates == alone
+        return grads, jax.tree.map(lambda a, b: jnp.where(first, a, b), fresh, state.opt_state)
 
     def _over_devices(self, sums: Any) -> Any:
         """`sums` added up over devices, in one exchange: at each they wait for the slowest.
@@ -342,11 +376,18 @@ def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None 
     """The learner of `policy` on `env`; `config` defaults to the preset `fast`.
 
     Raises:
-      ValueError: when the policy was shaped for another task, or the loss does not fit the task.
+      ValueError: when the policy was shaped for another task, the loss does not fit the task, or the
+        policy does not say which parameters are the critic's where the critic is to learn alone.
     """
     policy.check_fits(env)
-    if config is not None and config.loss == "hetnet" and policy.team.agents_leave:
+    config = config or LearnerConfig()
+    if config.loss == "hetnet" and policy.team.agents_leave:
         raise ValueError(
             "loss 'hetnet' has no place for agents that come and go; use loss 'actor_critic'."
         )
-    return Learner(env, policy, config or LearnerConfig())
+    if config.critic_epochs and not policy.module.critic_parameters:
+        raise ValueError(
+            f"critic_epochs {config.critic_epochs} needs to know what is the critic's alone: name "
+            f"it in critic_parameters of {type(policy.module).__name__}, or set critic_epochs to 0."
+        )
+    return Learner(env, policy, config)

@@ -19,17 +19,19 @@ def annealed(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
 
 
 def learning_rate(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
-    """Of the next update, after so many: warmed up, then annealed.
+    """Of the next update, after so many: `critic_rate` while the critic learns alone, then warmed
+    up, then annealed.
 
     Adam's first steps have the size of the rate whatever the gradient's: on a policy that was
     trained elsewhere they are noise, and the warm-up keeps them from wrecking it.
     """
     rate = config.learning_rate * annealed(config, updates)
-    if not config.warmup_epochs:
-        return rate
-    following = jnp.asarray(updates, jnp.float32) + 1
-    warm = following / (config.warmup_epochs * config.updates_per_epoch)
-    return rate * jnp.minimum(warm, 1.0)
+    alone = config.critic_epochs * config.updates_per_epoch
+    if config.warmup_epochs:
+        following = jnp.asarray(updates - alone, jnp.float32) + 1
+        warm = following / (config.warmup_epochs * config.updates_per_epoch)
+        rate = rate * jnp.minimum(warm, 1.0)
+    return jnp.where(updates < alone, config.critic_rate, rate) if alone else rate
 
 
 def make_optimiser(config: LearnerConfig) -> optax.GradientTransformation:

@@ -192,40 +192,77 @@ def play(
     The state tensors are encoded once, before the scan, and gathered by cell.
     """
     features, params = state_features(env, policy, params), policy.prepare(params)
-    beginning = policy.initial_carry((actors.episode_return.shape[0],))
-    agent_class = tuple(env.agent_class.tolist())
 
     def body(actors: Actors, draws: Draws) -> tuple[Actors, tuple[Actors, Trajectory]]:
-        active = jax.vmap(env.active)(actors.env_state)
-        carry, output = act(env, policy, params, features, actors, draws.noise)
-        env_state, transition = jax.vmap(env.step)(actors.env_state, output.action)
-        episode_return = actors.episode_return + transition.reward
-        done = transition.terminated | transition.truncated
-        presence = presence_in(env, actors.env_state, transition, env_state)
-        carry = hand_on(policy, carry, presence)
-        following = Actors(
-            env_state=select(done, draws.fresh, env_state),
-            carry=select(done, beginning, carry),
-            episode_return=select(done, jnp.zeros_like(episode_return), episode_return),
-        )
-        step = Trajectory(
-            decisions=output.decisions,
-            value=output.value,
-            communication=output.communication,
-            active=active,
-            episode_return=episode_return,
-            reward=transition.reward,
-            terminated=transition.terminated,
-            truncated=transition.truncated,
-            success=transition.success,
-            steps_taken=transition.steps_taken,
-            agent_class=agent_class,
-            max_steps=env.max_steps,
-            presence=presence,
-        )
+        following, step = advance(env, policy, params, features, actors, draws)
         return following, (actors, step)
 
     return jax.lax.scan(body, actors, draws, unroll=unroll)
+
+
+def advance(
+    env: Environment,
+    policy: Policy,
+    params: Any,
+    features: chex.Array | None,
+    actors: Actors,
+    draws: Draws,
+) -> tuple[Actors, Trajectory]:
+    """One step of all environments, and its record; leaves (E, ...), of `draws` too."""
+    beginning = policy.initial_carry((actors.episode_return.shape[0],))
+    active = jax.vmap(env.active)(actors.env_state)
+    carry, output = act(env, policy, params, features, actors, draws.noise)
+    env_state, transition = jax.vmap(env.step)(actors.env_state, output.action)
+    episode_return = actors.episode_return + transition.reward
+    done = transition.terminated | transition.truncated
+    presence = presence_in(env, actors.env_state, transition, env_state)
+    carry = hand_on(policy, carry, presence)
+    following = Actors(
+        env_state=select(done, draws.fresh, env_state),
+        carry=select(done, beginning, carry),
+        episode_return=select(done, jnp.zeros_like(episode_return), episode_return),
+    )
+    step = Trajectory(
+        decisions=output.decisions,
+        value=output.value,
+        communication=output.communication,
+        active=active,
+        episode_return=episode_return,
+        reward=transition.reward,
+        terminated=transition.terminated,
+        truncated=transition.truncated,
+        success=transition.success,
+        steps_taken=transition.steps_taken,
+        agent_class=tuple(env.agent_class.tolist()),
+        max_steps=env.max_steps,
+        presence=presence,
+    )
+    return following, step
+
+
+def stagger(
+    env: Environment, policy: Policy, params: Any, actors: Actors, keys: chex.PRNGKey
+) -> Actors:
+    """`actors` at staggered ages: each environment has been played for a number of steps of its
+    own, evenly drawn from 0 to the step limit.
+
+    Environments that all start at once stay in step: the first updates see beginnings of episodes
+    only, later ones ends only, and the first episodes to end are the quick ones, which makes the
+    first figures too good. Played ahead, they are as those of a training that has long been going.
+
+    Args:
+      keys: (E,) of the steps played here.
+    """
+    features, params = state_features(env, policy, params), policy.prepare(params)
+    waits = jax.vmap(lambda key: jax.random.randint(key, (), 0, env.max_steps + 1))(keys)
+
+    def body(actors: Actors, time: chex.Array) -> tuple[Actors, None]:
+        step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, time)
+        draws = jax.tree.map(lambda x: x[0], draw(env, policy, step_keys, 1))
+        following, _ = advance(env, policy, params, features, actors, draws)
+        return select(time >= waits, following, actors), None
+
+    return jax.lax.scan(body, actors, jnp.arange(env.max_steps))[0]
 
 
 def relive(

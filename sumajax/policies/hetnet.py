@@ -5,7 +5,7 @@ pair of classes has messages and attention of its own, and a state node per clas
 that class's critic reads. Messages are real vectors, or bits that the receivers decode.
 """
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import chex
 import jax
@@ -43,6 +43,7 @@ from sumajax.policies.types import (
 from sumajax.records import exportable
 
 Meta = Literal["normalised", "repo"]
+Critic = Literal["class", "agent"]
 
 NODES = ("P", "A", "S")
 """Predators, capture agents, and the two state nodes: the first is P's, the second A's."""
@@ -53,6 +54,16 @@ STATE_NODE = {"p2s": slice(0, 1), "a2s": slice(1, 2)}
 """Which of the two state nodes hears in a relation."""
 STATE_RELATIONS = tuple(STATE_NODE)
 """Relations, sender class first; a state node hears its own class only and tells nobody."""
+
+CRITIC_PARAMETERS = frozenset(
+    {"critic_P", "critic_A", "agent_critic_P", "agent_critic_A"}
+    | {
+        f"{layer}_{part}"
+        for layer in ("self_S", *STATE_RELATIONS)
+        for part in ("kernel", "bias", "dst", "src")
+    }
+)
+"""State nodes tell nobody: what they hear and how is for the value alone."""
 
 CLASS_ACTIONS = (5, 6)
 """Widths of the two classes' heads, whatever the task: a capture agent can also capture."""
@@ -291,6 +302,7 @@ class HetGraph(nn.Module):
     heads: int = 4
     features: int = 16
     bits: int | None = None
+    critic: Critic = "class"
 
     def setup(self) -> None:
         self.layer1 = HetLayer(
@@ -305,6 +317,9 @@ class HetGraph(nn.Module):
         )
         self.critic_P = Dense(1)
         self.critic_A = Dense(1)
+        if self.critic == "agent":
+            self.agent_critic_P = Dense(1)
+            self.agent_critic_A = Dense(1)
 
     def fold(self, num_p: int, num_a: int) -> tuple[Folded, Folded]:
         """Of both layers, for a team of so many."""
@@ -322,8 +337,8 @@ class HetGraph(nn.Module):
         """f_p (..., N_P, F_P), f_a (..., N_A, F_A), meta (2, 4), noise (..., 2, N, bits) by layer.
 
         Returns:
-          logits "P" (..., N_P, 5) and "A" (..., N_A, 6), value of each class (..., 2), and what was
-          said in each layer.
+          logits "P" (..., N_P, 5) and "A" (..., N_A, 6), value of each class (..., 2) or with
+          `critic="agent"` of each agent (..., N), and what was said in each layer.
         """
         noises = (noise[..., 0, :, :], noise[..., 1, :, :]) if noise is not None else (None, None)
         layer1, layer2 = folded or (None, None)
@@ -332,8 +347,16 @@ class HetGraph(nn.Module):
         out, second = self.layer2(hidden, noises[1], layer2)
         state = nn.relu(out["S"])
         critics = (self.critic_P(state[..., 0, :]), self.critic_A(state[..., 1, :]))
+        value = jnp.concatenate(critics, axis=-1)
+        if self.critic == "agent":
+            value = self._of_agents(value, hidden)
         logits = {"P": out["P"], "A": out["A"]}
-        return logits, jnp.concatenate(critics, axis=-1), (first, second)
+        return logits, value, (first, second)
+
+    def _of_agents(self, of_class: chex.Array, hidden: dict[str, chex.Array]) -> chex.Array:
+        """Value of each class (..., 2) -> of each agent (..., N): and what sets it apart."""
+        apart = [self.agent_critic_P(hidden["P"])[..., 0], self.agent_critic_A(hidden["A"])[..., 0]]
+        return jnp.concatenate([of_class[..., i : i + 1] + y for i, y in enumerate(apart)], axis=-1)
 
 
 class HetNetCore(nn.Module):
@@ -344,12 +367,15 @@ class HetNetCore(nn.Module):
     heads: int = 4
     features: int = 16
     bits: int | None = None
+    critic: Critic = "class"
 
     def setup(self) -> None:
         state, view = self.state_features, self.view_features
         self.lstm_state = LSTMCell(state, state)
         self.lstm_obs = LSTMCell(view, view)
-        self.graph = HetGraph((state + view, state), self.heads, self.features, self.bits)
+        self.graph = HetGraph(
+            (state + view, state), self.heads, self.features, self.bits, self.critic
+        )
 
     def project_states(self, x_state: chex.Array) -> chex.Array:
         """Encoded states (..., 128) -> (..., 512), the form `__call__` reads them in."""
@@ -390,6 +416,9 @@ class HetNet(PolicyModule):
     bits: int | None = None
     meta: Meta = "normalised"
     encoder: EncoderKind = "flat"
+    critic: Critic = "class"
+
+    critic_parameters: ClassVar[frozenset[str]] = CRITIC_PARAMETERS
 
     def __post_init__(self) -> None:
         _check_team(self.team)
@@ -398,7 +427,7 @@ class HetNet(PolicyModule):
     def setup(self) -> None:
         self.state_encoder = StateEncoder(self.encoder)
         self.view_encoder = ViewEncoder()
-        self.core = HetNetCore(bits=self.bits)
+        self.core = HetNetCore(bits=self.bits, critic=self.critic)
 
     def encode_states(self, states: chex.Array | SparseStates) -> chex.Array:
         return self.core.project_states(self.state_encoder(states))
@@ -420,14 +449,21 @@ class HetNet(PolicyModule):
             carry, state_features, x_obs, meta, noise.get("bits"), self.folded()["layers"]
         )
         agent_logits = mask_actions(_join_logits(logits, self.team.num_actions), self.team)
-        batch, capturer = value.shape[:-1], np.array(self.team.agent_class) == 1
+        batch = value.shape[:-1]
         output = PolicyOutput(
             decisions={"action": decide(agent_logits, noise["action"])},
-            value=jnp.where(lift(capturer, value.ndim), value[..., 1:], value[..., :1]),
+            value=self._of_agents(value),
             communication=_talk(exchanges, (*batch, num_p + num_a)),
             attention=_attention_matrix(exchanges[0].weights, num_p, num_a, batch),
         )
         return carry, output
+
+    def _of_agents(self, value: chex.Array) -> chex.Array:
+        """(..., 2) or (..., N) -> (..., N)."""
+        if self.critic == "agent":
+            return value
+        capturer = np.array(self.team.agent_class) == 1
+        return jnp.where(lift(capturer, value.ndim), value[..., 1:], value[..., :1])
 
     def initial_carry(self, batch_shape: tuple[int, ...]) -> HetNetCarry:
         state = jnp.zeros((*batch_shape, self.team.num_agents, STATE_FEATURES), jnp.float32)

@@ -4,7 +4,7 @@ Two rounds of messages per step, each over a directed graph drawn edge by edge. 
 heads of the same step only: nothing that was heard is remembered.
 """
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import chex
 import jax
@@ -205,6 +205,8 @@ class MAGIC(PolicyModule):
     setting: Setting = "medium"
     encoder: EncoderKind = "flat"
     fresh_memory: bool = False
+
+    critic_parameters: ClassVar[frozenset[str]] = frozenset({"value"})
 
     def setup(self) -> None:
         self.observation = ObservationEncoder(self.hidden, self.encoder)

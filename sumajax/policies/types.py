@@ -8,7 +8,7 @@ the agents of a class and none depends on how many there are: the same parameter
 import inspect
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import chex
 import jax
@@ -102,6 +102,10 @@ class PolicyModule(nn.Module, ABC):
     """What a policy file implements. `...` stands for any batch axes, usually E environments."""
 
     team: TeamSpec
+
+    critic_parameters: ClassVar[frozenset[str]] = frozenset()
+    """Names of modules and parameters that nothing but the value depends on: what can learn while
+    the policy stays as it is (`LearnerConfig.critic_epochs`)."""
 
     @abstractmethod
     def encode_states(self, states: chex.Array) -> chex.Array:
@@ -229,6 +233,15 @@ class Policy:
         chex.assert_shape(obs.view, (..., *self.team.view_shape))
         step = self.module.apply(params, carry, obs, noise, method=self.module.encode_and_step)
         return cast(tuple[Any, PolicyOutput], step)
+
+    def only_critic(self, params: Any) -> Any:
+        """bool for each leaf of `params`: whether nothing but the value depends on it."""
+        names = self.module.critic_parameters
+
+        def leaf(path: tuple[Any, ...], _: Any) -> bool:
+            return any(key.key in names for key in path)
+
+        return jax.tree_util.tree_map_with_path(leaf, params)
 
     @stated_precision
     def encode_states(self, params: Any, states: chex.Array) -> chex.Array:

@@ -17,8 +17,9 @@ from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import Learner, make_learner, preset
 from sumajax.learning.learner import mean_of, summarise, tally_of, until_episode_end
 from sumajax.learning.losses import LossParts, estimate_advantages, policy_gradient
-from sumajax.learning.rollout import last_value, rollout
+from sumajax.learning.rollout import last_value, rollout, start
 from sumajax.policies import make_policy
+from sumajax.policies.ic3net import IC3Net
 
 SHORT_EPOCH = {"num_envs": 200, "rollout_length": 20}  # 5 updates
 
@@ -169,7 +170,7 @@ class TestGradient:
 
 
 def gradient_inputs(tiny):
-    state = tiny.init(jax.random.key(0))
+    state = tiny.init(jax.random.key(1))
     return state.params, *tiny._inputs(state), state.updates
 
 
@@ -252,7 +253,9 @@ class TestFigures:
     def test_no_episode_ended(self):
         """NaN, not a zero that looks like a figure."""
         tiny = tiny_learner(ConstantReward(max_steps=3), num_envs=20_000, rollout_length=1)
-        _, metrics = tiny.train(tiny.init(jax.random.key(0)), 3)
+        state = tiny.init(jax.random.key(0))
+        together = start(tiny.env, tiny.policy, jax.random.split(jax.random.key(1), 20_000))
+        _, metrics = tiny.train(state.replace(actors=together), 3)
         np.testing.assert_array_equal(metrics.episodes, [0, 0, 20_000])
         for name in ("steps_taken", "success", "episode_return"):
             np.testing.assert_array_equal(np.isnan(getattr(metrics, name)), [True, True, False])
@@ -277,7 +280,78 @@ class TestFigures:
         assert (metrics.gradient_norm > 0).all()
 
 
+class TestCriticAlone:
+    """The first `critic_epochs`."""
+
+    CONFIG = {**SHORT_EPOCH, "critic_epochs": 1, "critic_rate": 0.01, "value_weight": 1.0}
+
+    def test_nothing_that_the_policy_depends_on_changes(self):
+        tiny = tiny_learner(TINY_TASK, "ic3net", **self.CONFIG)
+        state = tiny.init(jax.random.key(0))
+        after, metrics = tiny.train(state, 1)
+        for is_critic, a, b in zip(
+            jax.tree.leaves(tiny.policy.only_critic(state.params)),
+            jax.tree.leaves(state.params),
+            jax.tree.leaves(after.params),
+            strict=True,
+        ):
+            assert (a != b).any() == is_critic
+        assert not any(leaf.any() for leaf in jax.tree.leaves(metrics.fault))
+
+    def test_the_critic_learns(self):
+        tiny = tiny_learner(ConstantReward(), **{**self.CONFIG, "critic_epochs": 20})
+        _, metrics = tiny.train(tiny.init(jax.random.key(0)), 20)
+        assert metrics.value_loss[-1] < 0.01 * metrics.value_loss[0]
+
+    def test_then_all_learns_with_fresh_optimiser_memory(self):
+        tiny = tiny_learner(TINY_TASK, "ic3net", **self.CONFIG)
+        held, _ = tiny.train(tiny.init(jax.random.key(0)), 1)
+        after, _ = jax.jit(tiny.update)(held)
+        plain = replace(tiny, config=replace(tiny.config, critic_epochs=0))
+        anew = held.replace(opt_state=make_state(plain, held.params))
+        expected, _ = jax.jit(plain.update)(anew)
+        close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7)
+        jax.tree.map(close, after.params, expected.params)
+        for a, b in zip(*map(jax.tree.leaves, (held.params, after.params)), strict=True):
+            assert (a != b).any()
+
+    def test_a_policy_that_names_no_critic_is_refused(self):
+        policy = make_policy("iric", TINY_TASK)
+        nameless = replace(policy, module=Nameless(team=policy.team, communicates=False))
+        config = preset("fast", critic_epochs=1)
+        with pytest.raises(ValueError, match="critic_parameters"):
+            make_learner(TINY_TASK, nameless, config)
+        make_learner(TINY_TASK, nameless)
+
+
+class Nameless(IC3Net):
+    critic_parameters = frozenset()
+
+
 class TestStart:
+    def test_environments_are_at_staggered_ages(self):
+        """Every age alike, where all episodes last as long."""
+        tiny = tiny_learner(ConstantReward(max_steps=4, terminates=False), **SHORT_EPOCH)
+        actors = tiny.init(jax.random.key(0)).actors
+        ages = np.bincount(actors.env_state.time, minlength=4)
+        assert ages.size == 4
+        assert ages.min() > 200 / 4 / 2
+        np.testing.assert_array_equal(actors.episode_return[:, 0], actors.env_state.time)
+
+    def test_the_first_episodes_are_no_quicker_than_the_later_ones(self):
+        """A policy that stays as it is: its first epoch counts what its tenth does."""
+        tiny = tiny_learner(
+            PredatorPrey(size=4, num_predators=2, max_steps=100),
+            **{**SHORT_EPOCH, "learning_rate": 1e-9},
+        )
+        _, metrics = tiny.train(tiny.init(jax.random.key(0)), 10)
+        later = metrics.steps_taken[1:]
+        assert abs(metrics.steps_taken[0] - later.mean()) < 4 * later.std()
+
+    def test_with_whole_episodes_every_update_starts_afresh_anyway(self):
+        tiny = tiny_learner(settings="paper", num_envs=4, rollout_length=5)
+        assert not tiny.init(jax.random.key(0)).actors.env_state.time.any()
+
     def test_given_parameters_and_memory_are_kept(self):
         params = jax.tree.map(jnp.ones_like, fresh(0).params)
         memory = jax.tree.map(jnp.ones_like, fresh(0).opt_state)

@@ -115,3 +115,11 @@ def test_annealing_and_warm_up_of_the_rate():
     rates = [float(learning_rate(config, updates)) for updates in (0, 4, 9, 15, 20, 30)]
     expected = [0.1 * 0.1, 0.5 * 0.8 * 0.1, 0.55 * 0.1, 0.25 * 0.1, 0.0, 0.0]
     np.testing.assert_allclose(rates, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_the_critics_rate_comes_first_and_the_warm_up_after_it():
+    config = LearnerConfig(
+        **FEW, learning_rate=0.1, critic_epochs=1, critic_rate=0.5, warmup_epochs=1
+    )
+    rates = [float(learning_rate(config, updates)) for updates in (0, 9, 10, 14, 19, 30)]
+    np.testing.assert_allclose(rates, [0.5, 0.5, 0.01, 0.05, 0.1, 0.1], rtol=1e-6)

@@ -116,6 +116,22 @@ def test_a_class_has_one_value():
     assert value[3] == value[4]
 
 
+def test_agents_critics_give_every_agent_a_value():
+    policy = small("hetnet", CAPTURE_FIVE, critic="agent")
+    value = step(policy, observe(CAPTURE_FIVE, 0), params=parameters(policy)).value
+    assert value.shape == (5,)
+    assert len(set(value.tolist())) == 5
+
+
+def test_agents_critics_change_no_decision():
+    """And add two layers of 64 inputs, one for each class, to the published parameters."""
+    of_class, of_agent = (small("hetnet", CAPTURE_FIVE, critic=kind) for kind in ("class", "agent"))
+    assert size(of_agent) == size(of_class) + 2 * (64 + 1)
+    obs, params = observe(CAPTURE_FIVE, 0), parameters(of_agent)
+    published, ours = (step(policy, obs, params=params) for policy in (of_class, of_agent))
+    np.testing.assert_allclose(ours.logits, published.logits, rtol=1e-6)
+
+
 def test_predators_have_five_actions():
     logits = step(small("hetnet", CAPTURE_THREE), observe(CAPTURE_THREE, 0)).logits
     np.testing.assert_array_equal(logits[:2, 5], [MASKED_LOGIT] * 2)

@@ -214,6 +214,37 @@ def test_a_step_is_traced_once(name):
     assert traces == [name]
 
 
+@each_policy
+def test_only_the_value_depends_on_what_is_the_critics_alone(name):
+    """The decisions depend on everything else, in this step or by what the agents remember."""
+    policy = small(name, CAPTURE_FIVE)
+    params, obs = parameters(policy), observe(CAPTURE_FIVE, 0)
+
+    def outcome(params, weights):
+        carry, total = policy.initial_carry(), 0.0
+        for _ in range(2):
+            carry, output = policy.apply_with(params, carry, obs, greedy(policy))
+            logits = [decision.logits for decision in output.decisions.values()]
+            seen = {"value": output.value, "policy": (*logits, carry)}
+            for key, weight in weights.items():
+                total += weight * sum(
+                    jnp.where(abs(leaf) < -MASKED_LOGIT / 2, leaf, 0.0).sum()
+                    for leaf in jax.tree.leaves(seen[key])
+                )
+        return total
+
+    of_policy, of_value = (
+        jax.jit(jax.grad(outcome))(params, {key: 1.0}) for key in ("policy", "value")
+    )
+    alone = policy.only_critic(params)
+    for critic, g_policy, g_value in zip(
+        *map(jax.tree.leaves, (alone, of_policy, of_value)), strict=True
+    ):
+        if g_policy.any() or g_value.any():  # not what a closed gate leaves without a part
+            assert critic == (not g_policy.any())
+    assert any(jax.tree.leaves(alone))
+
+
 def test_apply_rejects_observations_of_another_task():
     policy, other = small("ic3net"), observe(CAPTURE_THREE, 0)
     with pytest.raises(AssertionError):
