@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from paper_claims import NOT_RUN, RULES, Claim, claims, number, said
-from paper_figures import figure_2
-from paper_parts import ABLATED, Budget, Part, PresetName, unchanged_arms
-from paper_results import Results, write_csv
-from paper_statistics import (
+
+from experiments.paper.claims import NOT_RUN, RULES, Claim, claims, number, said
+from experiments.paper.figures import figure_2
+from experiments.paper.parts import ABLATED, Budget, Part, PresetName, unchanged_arms
+from experiments.paper.published import EXPERIMENTS, SOURCES
+from experiments.paper.results import Results, write_csv
+from experiments.paper.statistics import (
     STATISTICS_COLUMNS,
     Comparison,
     Estimate,
@@ -25,8 +27,6 @@ from paper_statistics import (
     ratio_of,
     statistics,
 )
-from published import EXPERIMENTS, SOURCES
-
 from sumajax.reporting import write_text
 
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
@@ -285,7 +285,7 @@ def report(results: Results) -> str:
         by_name.setdefault(claim.name, []).append(claim)
     lines = [
         "# The paper's evidence, reproduced",
-        "Made by `python experiments/reproduce_paper.py --rebuild` from the CSV files beside it; "
+        "Made by `python -m experiments.paper --rebuild` from the CSV files beside it; "
         "nothing in it is written by hand. What was not run says so.",
         "## Claim by claim",
         markdown([_line(claim) for group in by_name.values() for claim in group]),

@@ -12,9 +12,9 @@ from typing import Any, Literal, get_args
 
 from pcp_transfer import PCPTransfer
 from pp_transfer import PPTransfer
-from published import EXPERIMENTS, SOURCES, Experiment
-
 from sumajax.cli.transfer_config import SOURCE, TRANSFER, TransferConfig
+
+from experiments.paper.published import EXPERIMENTS, SOURCES, Experiment
 from sumajax.environments import PredatorPrey
 from sumajax.learning import parallel, preset
 

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from published import EXPERIMENTS, Experiment
 from scipy.stats import bootstrap, trim_mean
 
+from experiments.paper.published import EXPERIMENTS, Experiment
 from sumajax.reporting.metrics import env_steps_to_threshold, seed_curves
 
 CONFIDENCE = 0.95

@@ -11,9 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
-from paper_statistics import Arm, Row, arm_of
-from published import EXPERIMENTS
 
+from experiments.paper.published import EXPERIMENTS
+from experiments.paper.statistics import Arm, Row, arm_of
 from sumajax.reporting.curves import FAINT, INK, dress, spread, write_png
 
 # Okabe and Ito's palette, as in the package's own curves; an experiment keeps its colour.

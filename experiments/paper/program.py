@@ -1,8 +1,8 @@
 """The paper's evidence in one command: Tables I and II, Figure 2, ablations, claim by claim.
 
-python experiments/reproduce_paper.py                                 # Table I and Q1, preset fast
-python experiments/reproduce_paper.py --experiments pp-hetnet --seeds 0 1 2 3 4
-python experiments/reproduce_paper.py --rebuild                       # tables and figures alone
+python -m experiments.paper                            # Table I and Q1, preset fast
+python -m experiments.paper --experiments pp-hetnet --seeds 0 1 2 3 4
+python -m experiments.paper --rebuild                       # tables and figures alone
 
 Stop it when you like; the same command goes on, and what is finished is not run again.
 """
@@ -19,7 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from paper_parts import (
+from sumajax.cli.command_line import parse, plain_errors, prepare_jax
+from sumajax.cli.transfer_config import MAX_DEVICES, MAX_EPOCHS, SOURCE, check_seeds
+
+from experiments.paper.parts import (
     SELECTIONS,
     TABLE_1,
     Budget,
@@ -31,8 +34,8 @@ from paper_parts import (
     parts_of,
     seeds_of,
 )
-from paper_report import PROVENANCE, write_report
-from paper_results import (
+from experiments.paper.report import PROVENANCE, write_report
+from experiments.paper.results import (
     FinishedRun,
     Results,
     changed_settings,
@@ -40,16 +43,13 @@ from paper_results import (
     machine,
     recognised,
 )
-from sumajax.cli.command_line import parse, plain_errors, prepare_jax
-from sumajax.cli.transfer_config import MAX_DEVICES, MAX_EPOCHS, SOURCE, check_seeds
-
 from sumajax import checkpoint
 from sumajax.description import versions
 from sumajax.experiment.run import run_experiment
 from sumajax.reporting import write_json
 from sumajax.transfer import StoppedError
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 SPEED_SEED = 0
 """The one that Table II is measured with."""
 
@@ -307,7 +307,7 @@ def import_runs(options: Options, results: Results) -> None:
 def measure(options: Options, results: Results) -> None:
     """Table II for the chosen experiments, a row at a time."""
     # Only this mode needs the learner itself.
-    from paper_speed import seconds_per_epoch
+    from experiments.paper.speed import seconds_per_epoch
 
     seeds = (SPEED_SEED,)
     for part in parts_of(options.experiments, options.preset):
@@ -388,7 +388,3 @@ def main() -> None:
         if not options.rebuild and not options.import_runs:
             prepare_jax(devices)
         run(options)
-
-
-if __name__ == "__main__":
-    main()

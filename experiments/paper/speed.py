@@ -7,8 +7,8 @@ from statistics import mean, stdev
 from typing import Any
 
 import jax
-
 from sumajax.cli.transfer_config import SOURCE, TransferConfig
+
 from sumajax.experiment.run import Run
 from sumajax.learning import parallel
 from sumajax.transfer import fresh_states, transferred_states

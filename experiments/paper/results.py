@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from published import EXPERIMENTS
-
 from sumajax.cli.transfer_config import SCRATCH, SOURCE, TRANSFER
+
+from experiments.paper.published import EXPERIMENTS
 from sumajax.learning import preset
 from sumajax.reporting import metrics as metrics_file
 

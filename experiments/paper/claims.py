@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from paper_statistics import (
+from experiments.paper.published import EXPERIMENTS, LARGEST_RATIO, SOURCES
+from experiments.paper.statistics import (
     BEST_EPOCHS,
     Comparison,
     Estimate,
@@ -15,7 +16,6 @@ from paper_statistics import (
     iqm,
     ratio_of,
 )
-from published import EXPERIMENTS, LARGEST_RATIO, SOURCES
 
 HOLDS, IN_PART, FAILS, NOT_RUN = "holds", "holds in part", "does not hold", "not run yet"
 
