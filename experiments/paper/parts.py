@@ -1,41 +1,38 @@
-"""What `reproduce_paper.py` is made of: parts, each one arm of one experiment in its own run.
+"""What the reproduction is made of: parts, each one arm of one experiment, with seeds of its own.
 
-A part trains from fresh parameters or goes on from the checkpoints of another part. Both are runs
-of `transfer_run.py`: an arm from scratch is the source stage of a run whose two tasks are the same.
+A part is an experiment of one stage: it trains from fresh parameters, or goes on from the
+checkpoints of another part.
 """
 
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
-from pcp_transfer import PCPTransfer
-from pp_transfer import PPTransfer
-from sumajax.cli.transfer_config import SOURCE, TRANSFER, TransferConfig
-
-from experiments.paper.published import EXPERIMENTS, SOURCES, Experiment
-from sumajax.environments import PredatorPrey
-from sumajax.learning import parallel, preset
+from experiments.paper.arms import (
+    ABLATIONS,
+    SCRATCH,
+    SCRATCH_BRIEF,
+    SOURCE,
+    SOURCE_PLAIN,
+    TRANSFER,
+    TRANSFER_BRIEF,
+    AblationName,
+    Arm,
+    with_start,
+)
+from experiments.paper.published import EXPERIMENTS, SOURCES, PaperExperiment
+from sumajax.environments.types import Environment
+from sumajax.experiment import Experiment, Stage
+from sumajax.learning import preset
+from sumajax.upsampling import StateUpsampled
 
 PresetName = Literal["fast", "paper"]
-Selection = Literal[
-    "pp-ic3net",
-    "pp-magic",
-    "pp-hetnet",
-    "pcp-hetnet-2p1c",
-    "pcp-hetnet-3p2c",
-    "q1",
-    "corner",
-    "mass",
-    "encoder",
-    "optimiser",
-    "short-source",
-    "lab-gap",
-]
-SELECTIONS: tuple[Selection, ...] = get_args(Selection)
-TABLE_1 = SELECTIONS[:6]
+Table1Name = Literal["pp-ic3net", "pp-magic", "pp-hetnet", "pcp-hetnet-2p1c", "pcp-hetnet-3p2c"]
+Selection = Literal[Table1Name, "q1", AblationName]
+TABLE_1: tuple[Selection, ...] = (*get_args(Table1Name), "q1")
 """What runs when nothing is chosen: Table I, and question Q1."""
+SELECTIONS: tuple[Selection, ...] = (*TABLE_1, *get_args(AblationName))
 
 FAST_SOURCE_EPOCHS = 50
 FAST_TARGET_EPOCHS = {"pp-ic3net": 125, "pp-magic": 60}
@@ -48,110 +45,69 @@ for MAGIC, by when all of their seeds have come to 20 steps. HetNet's many ablat
 ABLATED = ("pp-ic3net", "pp-hetnet")
 """Experiments that the ablations change."""
 
-Changes = tuple[tuple[str, Any], ...]
-
 
 @dataclass(frozen=True)
 class Part:
-    """One arm to train.
-
-    Attributes:
-      arm: `source`, `source-plain` (the source task without upsampling), `transfer` or `scratch`;
-        of an ablation with its name behind.
-      start: arm of the source experiment whose checkpoints it goes on from; None: fresh.
-      changes: options of the run that are not the experiment's own.
-      share: of the arm's budget.
-    """
+    """An arm of an experiment, by the experiment's name."""
 
     experiment: str
-    arm: str
-    start: str | None = None
-    changes: Changes = ()
-    share: float = 1.0
+    arm: Arm
+
+    def __str__(self) -> str:
+        return f"{self.experiment} {self.arm.name}"
 
     @property
-    def row(self) -> Experiment:
+    def row(self) -> PaperExperiment:
         return EXPERIMENTS[self.experiment]
 
     @property
-    def stage(self) -> str:
-        """The arm that the run itself calls it."""
-        return SOURCE if self.start is None else TRANSFER
+    def source(self) -> "Part | None":
+        """The part whose checkpoints it goes on from."""
+        return None if self.arm.start is None else Part(self.row.source_of, self.arm.start)
 
     @property
-    def source(self) -> tuple[str, str] | None:
-        """(experiment, arm) whose checkpoints it needs."""
-        return None if self.start is None else (self.row.source_of, self.start)
+    def env(self) -> Environment:
+        """The task as the policy sees it."""
+        if self.arm.task == "target":
+            return self.row.target
+        if self.arm.upsampling == "none":
+            return self.row.source
+        size = self.row.target.size
+        return StateUpsampled(self.row.source, size, self.arm.scale, self.arm.upsampling)
 
 
-def parts_of(selections: Iterable[str], preset_name: PresetName) -> list[Part]:
+def parts_of(selections: Iterable[Selection], preset_name: PresetName) -> list[Part]:
     """The parts of what was chosen, in order, each after the one it goes on from, none twice."""
-    found: dict[tuple[str, str], Part] = {}
-    for selection in selections:
-        for part in _selected(selection, preset_name):
-            found.setdefault((part.experiment, part.arm), part)
-    return list(found.values())
+    parts = (part for name in selections for part in _selected(name, preset_name))
+    return list(dict.fromkeys(parts))
 
 
-def _selected(selection: str, preset_name: PresetName) -> list[Part]:
+def _selected(selection: Selection, preset_name: PresetName) -> list[Part]:
     if selection in EXPERIMENTS:
         source = EXPERIMENTS[selection].source_of
-        return [
-            Part(source, "source"),
-            Part(selection, "transfer", "source"),
-            Part(selection, "scratch"),
-        ]
+        return [Part(source, SOURCE), Part(selection, TRANSFER), Part(selection, SCRATCH)]
     if selection == "q1":
-        return [Part(name, arm) for name in SOURCES for arm in ("source", "source-plain")]
-    return [part for name in ABLATED for part in ablation(selection, name, preset_name)]
+        return [Part(name, arm) for name in SOURCES for arm in (SOURCE, SOURCE_PLAIN)]
+    ablation = ABLATIONS[selection]
+    return [
+        Part(name, arm)
+        for name in ABLATED
+        for compared in (
+            *(unchanged_arms(name, preset_name) if ablation.beside_unchanged else ()),
+            *ablation.variants.values(),
+        )
+        for arm in with_start(compared)
+    ]
 
 
-def unchanged_arms(name: str, preset_name: PresetName) -> tuple[Part, Part]:
+def unchanged_arms(name: str, preset_name: PresetName) -> tuple[Arm, Arm]:
     """Transfer and scratch that an experiment's ablations are compared with.
 
     They have the ablations' own budget, as the learning rate may anneal to its end.
     """
-    brief = "-brief" if preset_name == "fast" and name in FAST_BRIEF_EPOCHS else ""
-    return Part(name, f"transfer{brief}", "source"), Part(name, f"scratch{brief}")
-
-
-def ablation(selection: str, name: str, preset_name: PresetName) -> list[Part]:
-    """The parts of one ablation of an experiment; the arms it is compared with included.
-
-    `lab-gap`, another encoder, is compared with arms of its own.
-    """
-    unchanged = (Part(name, "source"), *unchanged_arms(name, preset_name))
-    on_target: dict[str, Changes] = {
-        "encoder": (("leave_out", ("state_encoder",)),),
-        "optimiser": (("carry_optimiser", True),),
-    }
-    in_source: dict[str, Changes] = {
-        "corner": (("upsampling", "corner"),),
-        "mass": (("scale", "mass"),),
-    }
-    if selection in on_target:
-        changed = Part(name, f"transfer-{selection}", "source", on_target[selection])
-        return [*unchanged, changed]
-    if selection in in_source:
-        return [*unchanged, *_pair(name, selection, in_source[selection])]
-    if selection == "short-source":
-        short = [_pair(name, f"{share}", (), share / 100) for share in (25, 50)]
-        return [*unchanged, *short[0], *short[1]]
-    gap: Changes = (("encoder", "lab_gap"),)
-    native: Changes = (*gap, ("upsampling", "none"))
-    return [
-        *_pair(name, "lab-gap", gap),
-        *_pair(name, "lab-gap-native", native),
-        Part(name, "scratch-lab-gap", None, gap),
-    ]
-
-
-def _pair(name: str, variant: str, changes: Changes, share: float = 1.0) -> list[Part]:
-    """A source of its own and what is transferred from it."""
-    return [
-        Part(name, f"source-{variant}", None, changes, share),
-        Part(name, f"transfer-{variant}", f"source-{variant}", changes),
-    ]
+    if preset_name == "fast" and name in FAST_BRIEF_EPOCHS:
+        return TRANSFER_BRIEF, SCRATCH_BRIEF
+    return TRANSFER, SCRATCH
 
 
 @dataclass(frozen=True)
@@ -170,75 +126,59 @@ class Budget:
 
     def epochs(self, part: Part) -> int:
         """Of a part; at least one."""
-        on_source = part.arm.startswith("source")
-        given = self.source if on_source else self.target
+        given = self.source if part.arm.task == "source" else self.target
         if given is None:
-            given = max(1, round(self.scale * self._own(part, on_source)))
-        return max(1, round(part.share * given))
+            given = max(1, round(self.scale * self._own(part)))
+        return max(1, round(part.arm.share * given))
 
-    def _own(self, part: Part, on_source: bool) -> int:
+    def _own(self, part: Part) -> int:
         if self.preset == "paper":
-            arm = "source" if on_source else part.arm.split("-")[0]
-            return part.row.epochs[arm]
-        if on_source:
+            return part.row.epochs[part.arm.like]
+        if part.arm.task == "source":
             return FAST_SOURCE_EPOCHS
         own = FAST_TARGET_EPOCHS.get(part.experiment, FAST_TARGET_EPOCHS_OTHERS)
-        return FAST_BRIEF_EPOCHS.get(part.experiment, own) if "-" in part.arm else own
+        return FAST_BRIEF_EPOCHS.get(part.experiment, own) if part.arm.brief else own
 
 
-def directory_of(part: Part, preset_name: str, seeds: tuple[int, ...], runs: Path) -> Path:
-    """Of a part's run with these seeds."""
-    group = "-".join(map(str, seeds))
-    return runs / preset_name / part.experiment / part.arm / f"seeds-{group}"
-
-
-def seeds_of(directory: Path) -> tuple[int, ...]:
-    """What `directory_of` put into the name; nothing for any other."""
-    numbers = directory.name.removeprefix("seeds-").split("-")
-    return tuple(map(int, numbers)) if all(number.isdigit() for number in numbers) else ()
-
-
-def config_of(
-    part: Part,
-    budget: Budget,
-    seeds: tuple[int, ...],
-    directory: Path,
-    source: Path | None,
-    devices: int | None,
-) -> TransferConfig:
-    """The run of a part.
+def experiment_of(
+    part: Part, budget: Budget, seeds: tuple[int, ...], source: Path | None
+) -> Experiment:
+    """The experiment of a part: its one stage has the name of its arm.
 
     Args:
-      source: checkpoints it goes on from, of all these seeds.
-      devices: at most so many; None: as many as the machine's cores.
+      source: checkpoints it goes on from, of all these seeds; None for a part that does not.
     """
-    row, epochs = part.row, budget.epochs(part)
-    learner = preset(budget.preset, row.policy)
-    most = devices or os.cpu_count() or 1
-    options: dict[str, Any] = {
-        "policy": row.policy,
-        "preset": budget.preset,
-        "seeds": seeds,
-        "learner": learner,
-        "devices": parallel.most_devices(len(seeds), learner.num_envs, most),
-        "output": directory,
-        "scratch": False,
-        "evaluate_every": 0,
-        **dict(part.changes),
-    }
-    if part.start is not None:
-        options |= {"source": row.source, "target": row.target, "target_epochs": epochs}
-        options |= {"source_checkpoint": source}
-    else:
-        options |= {"source_epochs": epochs, "target_epochs": 0, **_fresh_tasks(part)}
-    return (PPTransfer if isinstance(row.target, PredatorPrey) else PCPTransfer)(**options)
+    arm, row = part.arm, part.row
+    stage = Stage(
+        arm.name,
+        part.env,
+        budget.epochs(part),
+        source,
+        preset(budget.preset, row.policy),
+        carry_optimiser=arm.carry_optimiser,
+        leave_out=arm.leave_out,
+    )
+    return Experiment(
+        (stage,),
+        policy=row.policy,
+        seeds=seeds,
+        policy_settings={} if arm.encoder == "flat" else {"encoder": arm.encoder},
+        name=str(part),
+        preset=budget.preset,
+        evaluate_every=0,
+    )
 
 
-def _fresh_tasks(part: Part) -> dict[str, Any]:
-    """Tasks of a run that trains from fresh parameters; two that are the same upsample nothing."""
-    row = part.row
-    if part.arm == "source-plain":
-        return {"source": row.source, "target": row.source}
-    if part.arm.startswith("scratch"):
-        return {"source": row.target, "target": row.target}
-    return {"source": row.source, "target": row.target}
+def part_directory(part: Part, preset_name: PresetName, runs: Path) -> Path:
+    """Where the runs of a part are, each with seeds of its own."""
+    return runs / preset_name / part.experiment / part.arm.name
+
+
+def run_directory(part: Part, preset_name: PresetName, seeds: Iterable[int], runs: Path) -> Path:
+    """Of a part's run with these seeds."""
+    return part_directory(part, preset_name, runs) / f"seeds-{'-'.join(map(str, seeds))}"
+
+
+def checkpoints_in(run: Path, part: Part) -> Path:
+    """Where a run keeps the checkpoints of a part."""
+    return run / "checkpoints" / part.arm.name
