@@ -301,8 +301,8 @@ def report(results: Results) -> str:
         "## Budgets",
         _budgets(results, known),
         "## Commands",
-        "As they were given at their commits; the program was `experiments/reproduce_paper.py` before "
-        "it became `python -m experiments.paper`.",
+        "As they were given at their commits; the program was `experiments/reproduce_paper.py` "
+        "before it became `python -m experiments.paper`.",
         _commands(results.directory),
     ]
     return "\n\n".join(line.rstrip("\n") for line in lines) + "\n"

@@ -131,7 +131,7 @@ MISTAKES = {
 def test_a_mistake_gets_one_sentence(options, sentence, tmp_path, monkeypatch, capsys):
     """Ours, or what the parser says in its box."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(program, "prepare_jax", lambda devices: None)
+    monkeypatch.setattr(program, "keep_compiled", lambda: None)
     command = ["experiments.paper", *options.split(), "--output", "results"]
     monkeypatch.setattr(sys, "argv", command)
     with pytest.raises(SystemExit) as stop:
