@@ -1,17 +1,22 @@
 """What the paper says of its five experiments (Tables I and II), and the budgets that follow.
 
-Every number here is the paper's own; none is ours. The rows of Table II are as algorithms.md 5.6
-reads them from the paper's text.
+Every number here is the paper's own; none is ours. The rows of Table II's sources are taken in the
+order in which they stand in the paper's text.
 """
 
 import math
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 
 LARGEST_RATIO = 7.88
 """The abstract's and the conclusion's figure, of PCP 3P/2C."""
+
+
+TableArm = Literal["source-plain", "source", "scratch", "transfer"]
+"""What Table II has a row of, by our name; `source-plain` is the source without upsampling."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +28,7 @@ class SecondsPerEpoch:
 
 
 @dataclass(frozen=True)
-class Experiment:
+class PaperExperiment:
     """A row of Table I: tasks and policy, and what the paper reports.
 
     Attributes:
@@ -32,7 +37,7 @@ class Experiment:
       hours: T, the fixed hour at which Table I compares.
       scratch, transfer: steps taken in the hour before T.
       pretraining: epochs on the source task before the transfer.
-      seconds: Table II, by our name of the arm; `source-plain` is the source without upsampling.
+      seconds: Table II.
     """
 
     name: str
@@ -44,25 +49,32 @@ class Experiment:
     scratch: float
     transfer: float
     pretraining: int
-    seconds: dict[str, SecondsPerEpoch]
+    seconds: dict[TableArm, SecondsPerEpoch]
     source_of: str
+
+    @property
+    def source_title(self) -> str:
+        """What its source is called: its own title, without the target."""
+        return self.title.rsplit(",", 1)[0]
 
     @property
     def ratio(self) -> float:
         """Steps taken from scratch over steps taken after transfer, cut off as the paper does."""
         return math.floor(100 * self.scratch / self.transfer) / 100
 
-    def hours_of(self, arm: str, epochs: float) -> float:
-        """The paper's hours for so many epochs of an arm; a variant costs what its arm costs."""
-        return epochs * self.seconds[cost_of(arm)].mean / 3600
+    def hours_of(self, arm: TableArm, epochs: float) -> float:
+        """The paper's hours for so many epochs of an arm."""
+        return epochs * self.seconds[arm].mean / 3600
 
-    def epochs_at(self, arm: str, hours: float) -> int:
+    def epochs_at(self, arm: TableArm, hours: float) -> int:
         """The number of epochs that come nearest to so many of the paper's hours."""
-        return round(hours * 3600 / self.seconds[cost_of(arm)].mean)
+        return round(hours * 3600 / self.seconds[arm].mean)
 
     @property
-    def epochs(self) -> dict[str, int]:
-        """The paper's budgets, by arm (algorithms.md 5.6)."""
+    def epochs(self) -> dict[TableArm, int]:
+        """The paper's budgets: its pre-training, then until the hour T of Table I at the seconds
+        per epoch of Table II.
+        """
         left = self.hours - self.hours_of("source", self.pretraining)
         return {
             "source": self.pretraining,
@@ -72,22 +84,29 @@ class Experiment:
         }
 
 
-def cost_of(arm: str) -> str:
-    """The arm of Table II that an arm costs as much as: `transfer-mass` as `transfer`."""
-    return arm if arm == "source-plain" else arm.split("-")[0]
+Seconds = tuple[float, float]
 
 
-def _seconds(**values: tuple[float, float]) -> dict[str, SecondsPerEpoch]:
-    return {name.replace("_", "-"): SecondsPerEpoch(*value) for name, value in values.items()}
+def _seconds(
+    *, source_plain: Seconds, source: Seconds, scratch: Seconds, transfer: Seconds
+) -> dict[TableArm, SecondsPerEpoch]:
+    return {
+        "source-plain": SecondsPerEpoch(*source_plain),
+        "source": SecondsPerEpoch(*source),
+        "scratch": SecondsPerEpoch(*scratch),
+        "transfer": SecondsPerEpoch(*transfer),
+    }
 
 
 _PP_SOURCE = PredatorPrey(size=5, num_predators=3, vision=1, max_steps=80)
 _PP_TARGET = PredatorPrey(size=10, num_predators=5, vision=1, max_steps=200)
 _PCP_SOURCE = PredatorCapturePrey(size=5, num_predators=2, num_capturers=1, max_steps=80)
-_PCP_SOURCE_SECONDS = {"source_plain": (490.64, 2.46), "source": (315.05, 0.87)}
+_PCP_SOURCE_SECONDS: dict[str, Seconds] = {"source_plain": (490.64, 2.46), "source": (315.05, 0.87)}
 
-_predator_prey = partial(Experiment, source=_PP_SOURCE, target=_PP_TARGET)
-_capture = partial(Experiment, policy="hetnet", source=_PCP_SOURCE, source_of="pcp-hetnet-2p1c")
+_predator_prey = partial(PaperExperiment, source=_PP_SOURCE, target=_PP_TARGET)
+_capture = partial(
+    PaperExperiment, policy="hetnet", source=_PCP_SOURCE, source_of="pcp-hetnet-2p1c"
+)
 
 _ROWS = (
     _predator_prey(

@@ -11,9 +11,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
-from paper_statistics import Arm, Row, arm_of
-from published import EXPERIMENTS
 
+from experiments.paper.arms import SCRATCH, SOURCE, SOURCE_PLAIN, TRANSFER, Arm, Task
+from experiments.paper.published import EXPERIMENTS
+from experiments.paper.statistics import Curves, Row, curves_of
 from sumajax.reporting.curves import FAINT, INK, dress, spread, write_png
 
 # Okabe and Ito's palette, as in the package's own curves; an experiment keeps its colour.
@@ -44,9 +45,9 @@ class Panel:
 
     title: str
     experiments: tuple[str, ...]
-    task: str
-    ours: str
-    other: str
+    task: Task
+    ours: Arm
+    other: Arm
     words: tuple[str, str]
 
 
@@ -55,10 +56,10 @@ _TARGET = ("transferred", "from scratch")
 _PP = ("pp-ic3net", "pp-magic", "pp-hetnet")
 _PCP = ("pcp-hetnet-2p1c", "pcp-hetnet-3p2c")
 PANELS = (
-    Panel("(a) PP 5x5 source", _PP, "source", "source", "source-plain", _SOURCE),
-    Panel("(b) PP 10x10 target", _PP, "target", "transfer", "scratch", _TARGET),
-    Panel("(c) PCP 5x5 source", _PCP[:1], "source", "source", "source-plain", _SOURCE),
-    Panel("(d) PCP 10x10 target", _PCP, "target", "transfer", "scratch", _TARGET),
+    Panel("(a) PP 5x5 source", _PP, "source", SOURCE, SOURCE_PLAIN, _SOURCE),
+    Panel("(b) PP 10x10 target", _PP, "target", TRANSFER, SCRATCH, _TARGET),
+    Panel("(c) PCP 5x5 source", _PCP[:1], "source", SOURCE, SOURCE_PLAIN, _SOURCE),
+    Panel("(d) PCP 10x10 target", _PCP, "target", TRANSFER, SCRATCH, _TARGET),
 )
 
 AXES = {
@@ -106,29 +107,31 @@ def figure_2(
     return figure
 
 
-Curves = Mapping[tuple[str, str], tuple[Arm, Arm | None]]
+Drawn = Mapping[tuple[str, Arm], tuple[Curves, Curves | None]]
 
 
-def _curves(rows: list[Row], panel: Panel, preset: str) -> Curves:
+def _curves(rows: list[Row], panel: Panel, preset: str) -> Drawn:
     """(experiment, arm) -> its curves, and the source they start behind."""
     found = {}
     for name in panel.experiments:
         for arm in (panel.other, panel.ours):
-            curve = arm_of(rows, name, arm, preset)
+            curve = curves_of(rows, name, arm, preset)
             source = None
-            if arm == "transfer":
-                source = arm_of(rows, EXPERIMENTS[name].source_of, "source", preset)
+            if arm.start is not None:
+                source = curves_of(rows, EXPERIMENTS[name].source_of, arm.start, preset)
             if curve is not None:
                 found[name, arm] = (curve, source)
     return found
 
 
-def _x(arm: Arm, x: str) -> np.ndarray:
+def _x(arm: Curves, x: str) -> np.ndarray:
     values = arm.hours if x == "hours" else getattr(arm, x).mean(0)
     return np.asarray(values) / UNITS[x]
 
 
-def _draw(axes: Axes, x: str, arm: Arm, source: Arm | None, experiment: str, full: bool) -> None:
+def _draw(
+    axes: Axes, x: str, arm: Curves, source: Curves | None, experiment: str, full: bool
+) -> None:
     shift = _x(source, x)[-1] if source is not None else 0.0
     position = shift + _x(arm, x)
     middle, low, high = spread(arm.filled)
@@ -179,7 +182,7 @@ def _dress(axes: Axes, label: str, empty: bool) -> None:
         axes.text(0.5, 0.5, "not run yet", transform=axes.transAxes, ha="center", color=FAINT)
 
 
-def _title(panel: Panel, curves: Curves) -> str:
+def _title(panel: Panel, curves: Drawn) -> str:
     """What the panel is, what its lines are, and which of them are missing."""
     drawn = {arm for _, arm in curves}
     ours, other = (
@@ -189,7 +192,7 @@ def _title(panel: Panel, curves: Curves) -> str:
     return f"{panel.title}: full line {ours}, dashed {other}"
 
 
-def _legend(part: SubFigure, panel: Panel, curves: Curves) -> None:
+def _legend(part: SubFigure, panel: Panel, curves: Drawn) -> None:
     names = [name for name in panel.experiments if any(key[0] == name for key in curves)]
     handles = [Line2D([], [], color=COLOURS[name]) for name in names]
     if handles:

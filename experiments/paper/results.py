@@ -1,6 +1,6 @@
 """The kept files of the paper's reproduction: curves and evaluations, taken from run directories.
 
-Everything that is shown is made from these files alone (`paper_report.py`): a row belongs to one
+Everything that is shown is made from these files alone (`report.py`): a row belongs to one
 experiment, arm, preset and seed, and a run replaces all rows of those it trained.
 """
 
@@ -11,13 +11,18 @@ import platform
 import subprocess
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from published import EXPERIMENTS
-
-from sumajax.cli.transfer_config import SCRATCH, SOURCE, TRANSFER
-from sumajax.learning import preset
+from experiments.paper.arms import SCRATCH, SOURCE, TRANSFER
+from experiments.paper.parts import Part
+from experiments.paper.published import EXPERIMENTS
+from sumajax.description import describe
+from sumajax.experiment.directory import plain
+from sumajax.experiment.records import StageRecords
+from sumajax.learning import LearnerConfig, preset
+from sumajax.policies import make_policy
 from sumajax.reporting import metrics as metrics_file
 
 KEY = ("experiment", "arm", "preset", "seed")
@@ -83,9 +88,9 @@ class Results:
         kept = [r for r in self.rows[name] if tuple(r[column] for column in key) not in new]
         self.rows[name] = sorted(kept + rows, key=_order)
 
-    def last_epochs(self, experiment: str, arm: str, preset_name: str) -> dict[int, int]:
-        """The last epoch of every seed that is kept."""
-        wanted = (experiment, arm, preset_name)
+    def last_epochs(self, part: Part, preset_name: str) -> dict[int, int]:
+        """The last epoch of every seed of a part that is kept."""
+        wanted = (part.experiment, part.arm.name, preset_name)
         last: dict[int, int] = {}
         for row in self.rows["curves"]:
             if (row["experiment"], row["arm"], row["preset"]) == wanted:
@@ -101,166 +106,195 @@ class Results:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run directory, and what its arms are called here.
+    """A run directory, and what its stages are called here.
 
     Attributes:
-      names: (experiment, arm) by the run's own name of an arm.
+      parts: by the name of the stage.
     """
 
     directory: Path
-    names: dict[str, tuple[str, str]]
+    parts: Mapping[str, Part]
 
-    @property
+    @cached_property
     def config(self) -> dict[str, Any]:
         return json.loads((self.directory / "config.json").read_text())
 
     @property
-    def options(self) -> dict[str, Any]:
-        return self.config["options"]
+    def plan(self) -> dict[str, Any]:
+        """The whole plan, resolved: every stage with its task, start and learner."""
+        return self.config["experiment"]
 
     @property
-    def summary(self) -> dict[str, Any]:
-        """Empty while the run goes on."""
-        file = self.directory / "summary.json"
-        return json.loads(file.read_text()) if file.exists() else {}
+    def has_ended(self) -> bool:
+        return (self.directory / "summary.json").exists()
 
     def curves(self) -> list[Row]:
-        """Rows of the arms that came to their end."""
+        """Rows of the stages, epoch by epoch."""
         rows = metrics_file.read_metrics(self.directory / "metrics.csv")
-        at_once = len(self.options["seeds"])
         return [
             {
-                **self._key(row["arm"], row["seed"]),
+                **self._key(self.parts[row["arm"]], row["seed"]),
                 **{name: row[name] for name in ("epoch", "env_steps", "seconds")},
-                "seeds_at_once": at_once,
+                "seeds_at_once": len(self.plan["seeds"]),
                 **{name: row[name] for name in ("steps_taken", "success")},
             }
             for row in rows
-            if row["arm"] in self.names
+            if row["arm"] in self.parts
         ]
 
     def evaluations(self) -> list[Row]:
-        """Held-out episodes of the final policies, and of the source's on the target."""
-        summary = self.summary
-        found = {
-            name: (name, summary[name]["env_steps"], summary[name]["evaluation"])
-            for name in self.names
-            if summary.get(name)
-        }
-        if TRANSFER in found and summary.get("zero_shot"):
-            looks = {"sampled": summary["zero_shot"], "greedy": summary["zero_shot_greedy"]}
-            found["zero-shot"] = (TRANSFER, 0, looks)
+        """Held-out episodes of the final policies, and of those that a stage started from."""
+        records = StageRecords(self.directory / "stages.json")
+        rows = []
+        for stage, part in self.parts.items():
+            record = records[stage]
+            if result := record.get("result"):
+                rows += self._evaluated(part, result["env_steps"], result["evaluation"])
+            if part.arm.zero_shot and record.get("zero_shot"):
+                zero_shot = {"arm": part.arm.zero_shot}
+                rows += [row | zero_shot for row in self._evaluated(part, 0, record["zero_shot"])]
+        return rows
+
+    def _evaluated(
+        self, part: Part, env_steps: int, modes: Mapping[str, Mapping[str, Any]]
+    ) -> list[Row]:
+        """A row per seed and way of choosing actions."""
         return [
             {
-                **self._key(arm, seed),
+                **self._key(part, seed),
                 "env_steps": env_steps,
                 "mode": mode,
                 "episodes": held_out["episodes"],
                 **{name: held_out[name][i] for name in ("steps_taken", "success", "return")},
-                **({"arm": self._zero_shot} if name == "zero-shot" else {}),
             }
-            for name, (arm, env_steps, modes) in found.items()
             for mode, held_out in modes.items()
-            if held_out
-            for i, seed in enumerate(summary["seeds"])
+            for i, seed in enumerate(self.plan["seeds"])
         ]
-
-    @property
-    def _zero_shot(self) -> str:
-        return self.names[TRANSFER][1].replace(TRANSFER, "zero-shot", 1)
 
     def references(self) -> list[Row]:
         """A random policy and the shortest paths, on the tasks as this experiment has them."""
-        levels = self.summary.get("references", {})
-        task = {SOURCE: "source", TRANSFER: "target", SCRATCH: "target"}
-        # An arm from scratch is the source stage of a run with one task.
+        if not self.has_ended:
+            return []
+        summary = json.loads((self.directory / "summary.json").read_text())
+        levels = summary.get("references", {})
         where = {
-            (experiment, "target" if name.startswith(SCRATCH) else "source"): levels["source"]
-            for arm, (experiment, name) in self.names.items()
-            if levels and task[arm] == "source"
-        }
-        where |= {
-            (experiment, "target"): levels["target"]
-            for arm, (experiment, _) in self.names.items()
-            if levels and task[arm] == "target"
+            (part.experiment, part.arm.task): levels[stage]
+            for stage, part in self.parts.items()
+            if stage in levels
         }
         return [
             {
                 "experiment": experiment,
-                "task": on,
+                "task": task,
                 "random_steps_taken": level["random_steps_taken"],
                 "random_success": level["random_success"],
                 "shortest_paths": level["shortest_path_steps"],
             }
-            for (experiment, on), level in where.items()
+            for (experiment, task), level in where.items()
         ]
 
-    def _key(self, arm: str, seed: int) -> Row:
-        experiment, name = self.names[arm]
-        named = self.options["preset"]
-        return {"experiment": experiment, "arm": name, "preset": named, "seed": seed}
-
-
-DEFAULTS = {
-    "scale": "none",
-    "upsampling": "blocks",
-    "encoder": "flat",
-    "carry_optimiser": False,
-    "leave_out": [],
-}
-"""What an experiment of Table I has; a run with anything else is none of them."""
+    def _key(self, part: Part, seed: int) -> Row:
+        return {
+            "experiment": part.experiment,
+            "arm": part.arm.name,
+            "preset": self.plan["preset"],
+            "seed": seed,
+        }
 
 
 def recognised(directory: Path) -> FinishedRun:
     """A run of `pp_transfer.py` or `pcp_transfer.py` as the experiment of Table I that it is.
 
-    Only arms that came to their end count.
+    Only stages that came to their end count.
 
     Raises:
       ValueError: for a directory that is no such run.
     """
     try:
-        options = json.loads((directory / "config.json").read_text())["options"]
-        tasks = {name: options[name] for name in ("source", "target")}
-        budgets = {SOURCE: options["source_epochs"]} | dict.fromkeys(
-            (TRANSFER, SCRATCH), options["target_epochs"]
-        )
+        plan = json.loads((directory / "config.json").read_text())["experiment"]
+        stages = {stage["name"]: stage for stage in plan["stages"]}
         rows = metrics_file.read_metrics(directory / "metrics.csv")
+        matches = [found for name in EXPERIMENTS if (found := _parts_of(plan, name)) is not None]
+        ended = [
+            name
+            for name, stage in stages.items()
+            if metrics_file.complete_epochs(rows, name) == stage["epochs"]
+        ]
     except (OSError, ValueError, KeyError, TypeError):
         raise ValueError(
             f"{directory} is no run of pp_transfer.py or pcp_transfer.py; give its directory."
         ) from None
-    matches = [
-        row
-        for row in EXPERIMENTS.values()
-        if row.policy == options["policy"]
-        and all(_same(tasks[name], asdict(getattr(row, name))) for name in tasks)
-    ]
-    changed = [name for name, value in DEFAULTS.items() if options.get(name, value) != value]
-    if not matches or changed:
-        why = f"its {changed[0]} is {options[changed[0]]}" if changed else "by tasks and policy"
-        raise ValueError(f"{directory} is none of the paper's experiments ({why}); leave it out.")
-    (row,) = matches
-    names = {
-        arm: (row.source_of if arm == SOURCE else row.name, arm)
-        for arm, epochs in budgets.items()
-        if epochs and metrics_file.complete_epochs(rows, arm) == epochs
+    if not matches:
+        raise ValueError(
+            f"{directory} is none of the paper's experiments (by tasks, policy, upsampling and "
+            "what is carried over); leave it out."
+        )
+    if not ended:
+        raise ValueError(f"{directory} has no stage that came to its end; let it run first.")
+    return FinishedRun(directory, {name: matches[0][name] for name in ended})
+
+
+def _parts_of(plan: Mapping[str, Any], name: str) -> dict[str, Part] | None:
+    """What part of an experiment each stage of a plan is; None if one of them is none."""
+    found: dict[str, Part] = {}
+    for stage in plan["stages"]:
+        start = stage["start"]
+        before = found[start].arm if isinstance(start, str) else None
+        part = next(
+            (
+                part
+                for part in _candidates(name)
+                if (start is None) == (part.arm.start is None)
+                and before in (None, part.arm.start)
+                and _is(part, plan, stage)
+            ),
+            None,
+        )
+        if part is None:
+            return None
+        found[stage["name"]] = part
+    return found
+
+
+def _candidates(name: str) -> list[Part]:
+    """The parts of an experiment of Table I."""
+    return [Part(EXPERIMENTS[name].source_of, SOURCE), Part(name, TRANSFER), Part(name, SCRATCH)]
+
+
+def _is(part: Part, plan: Mapping[str, Any], stage: Mapping[str, Any]) -> bool:
+    """Whether a stage of a config.json trains a part, however long."""
+    policy = make_policy(part.row.policy, part.env)
+    ours = describe(part.env, policy)
+    return (
+        _same(plan["policy"], ours["policy"])
+        and _same(stage["task"], ours["task"])
+        and stage["carry_optimiser"] == part.arm.carry_optimiser
+        and tuple(stage["leave_out"]) == part.arm.leave_out
+    )
+
+
+def _same(given: Any, ours: Any) -> bool:
+    """Whether a description is ours; settings that it does not know have their default."""
+    if isinstance(given, Mapping) and isinstance(ours, Mapping):
+        return all(_same(given[name], ours[name]) for name in ours if name in given)
+    return bool(given == ours)
+
+
+def changed_settings(plan: Mapping[str, Any]) -> list[str]:
+    """Settings of a plan's learners that are not those of this version's preset."""
+    own = preset(plan["preset"], plan["policy"]["name"])
+    changed = {
+        name: None
+        for stage in plan["stages"]
+        for name, value in _trained_with(own, stage).items()
+        if stage["learner"].get(name, value) != value
     }
-    if not names:
-        raise ValueError(f"{directory} has no arm that came to its end; let it run first.")
-    return FinishedRun(directory, names)
+    return list(changed)
 
 
-def changed_settings(options: Mapping[str, Any]) -> list[str]:
-    """Settings of a run's learner that are not those of this version's preset."""
-    given = options["learner"]
-    ours = asdict(preset(options["preset"], options["policy"]))
-    return [name for name, value in ours.items() if given.get(name, value) != value]
-
-
-def _same(given: Mapping[str, Any], ours: Mapping[str, Any]) -> bool:
-    """Whether a task of a config.json is ours; settings it does not know have their default."""
-    return all(given.get(name, value) == value for name, value in ours.items())
+def _trained_with(learner: LearnerConfig, stage: Mapping[str, Any]) -> dict[str, Any]:
+    transferred = stage["start"] is not None
+    return plain(asdict(learner.for_stage(stage["epochs"], transferred=transferred)))
 
 
 def machine() -> dict[str, Any]:

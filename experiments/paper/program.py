@@ -1,8 +1,8 @@
 """The paper's evidence in one command: Tables I and II, Figure 2, ablations, claim by claim.
 
-python experiments/reproduce_paper.py                                 # Table I and Q1, preset fast
-python experiments/reproduce_paper.py --experiments pp-hetnet --seeds 0 1 2 3 4
-python experiments/reproduce_paper.py --rebuild                       # tables and figures alone
+python -m experiments.paper                          # Table I and Q1, preset fast
+python -m experiments.paper --experiments pp-hetnet --seeds 0 1 2 3 4
+python -m experiments.paper --rebuild                # tables and figures alone
 
 Stop it when you like; the same command goes on, and what is finished is not run again.
 """
@@ -12,27 +12,30 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from paper_parts import (
+
+from experiments.paper.arms import TABLE_2
+from experiments.paper.parts import (
     SELECTIONS,
     TABLE_1,
     Budget,
     Part,
     PresetName,
     Selection,
-    config_of,
-    directory_of,
+    checkpoints_in,
+    experiment_of,
+    part_directory,
     parts_of,
-    seeds_of,
+    run_directory,
 )
-from paper_report import PROVENANCE, write_report
-from paper_results import (
+from experiments.paper.report import PROVENANCE, write_report
+from experiments.paper.results import (
     FinishedRun,
     Results,
     changed_settings,
@@ -40,16 +43,19 @@ from paper_results import (
     machine,
     recognised,
 )
-from sumajax.cli.command_line import parse, plain_errors, prepare_jax
-from sumajax.cli.transfer_config import MAX_DEVICES, MAX_EPOCHS, SOURCE, check_seeds
-
+from experiments.paper.speed import seconds_per_epoch
 from sumajax import checkpoint
+from sumajax.cli.options import keep_compiled, parse, plain_errors
+from sumajax.cli.transfer import MAX_DEVICES
 from sumajax.description import versions
-from sumajax.experiment.run import run_experiment
+from sumajax.experiment import Experiment, run_experiment
+from sumajax.experiment.plan import MAX_EPOCHS, check_seeds
+from sumajax.experiment.run import Where
+from sumajax.learning import parallel
 from sumajax.reporting import write_json
 from sumajax.transfer import StoppedError
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 SPEED_SEED = 0
 """The one that Table II is measured with."""
 
@@ -73,15 +79,15 @@ class Options:
     target_epochs: int | None = None
     """Epochs of every target arm instead of the preset's."""
     devices: int | None = None
-    """CPU devices to use at most; None: one per core."""
+    """Devices to use at most; None: all there are, of CPUs one per core."""
     output: Path = RESULTS
     """Where the CSV files, tables, figures and the report are kept."""
-    runs: Path = Path("runs/reproduce_paper")
+    runs: Path = Path("runs/paper")
     """Where the run directories with their checkpoints are."""
     rebuild: bool = False
     """Train nothing; make tables, figures and report again from the CSV files in output."""
     import_runs: tuple[Path, ...] = ()
-    """Train nothing; keep the finished arms of these runs of pp_transfer.py or pcp_transfer.py."""
+    """Train nothing; keep the finished stages of these runs of `sumajax transfer`."""
     import_commit: str = "unknown"
     """The commit that the imported runs are of, which they do not say themselves."""
     measure_speed: bool = False
@@ -179,11 +185,11 @@ def missing_seeds(part: Part, options: Options, results: Results) -> set[int]:
       ValueError: when one of another length is: it is evidence that nothing may overwrite.
     """
     epochs = options.budget.epochs(part)
-    kept = results.last_epochs(part.experiment, part.arm, options.preset)
+    kept = results.last_epochs(part, options.preset)
     for seed in options.seeds:
         if kept.get(seed, epochs) != epochs:
             raise ValueError(
-                f"{results.directory} holds {kept[seed]} epochs of {part.experiment} {part.arm}, "
+                f"{results.directory} holds {kept[seed]} epochs of {part}, "
                 f"preset {options.preset}, seed {seed}, not {epochs}; choose another --output or "
                 "the same epochs."
             )
@@ -196,7 +202,7 @@ def _needed_by(
     """Seeds whose checkpoints other parts go on from, and that are nowhere to be found."""
     wanted: set[int] = set()
     for other, seeds in missing.items():
-        if other.source == (part.experiment, part.arm):
+        if other.source == part:
             wanted |= seeds
     there = {seed for seeds, _ in checkpoints_of(part, options, results) for seed in seeds}
     return wanted - there
@@ -213,8 +219,7 @@ def groups(
     left = set(seeds)
     starts: list[tuple[tuple[int, ...], Path | None]] = [(tuple(sorted(left)), None)]
     if part.source is not None:
-        source = Part(*part.source)
-        starts = [*checkpoints_of(source, options, results)]
+        starts = [*checkpoints_of(part.source, options, results)]
     for begun in _begun(part, options):
         if left & set(begun):
             found.append((begun, _start(begun, starts)))
@@ -234,9 +239,9 @@ def _start(
 
 def _begun(part: Part, options: Options) -> list[tuple[int, ...]]:
     """Seeds of the runs of a part, finished or not."""
-    directory = directory_of(part, options.preset, (), options.runs).parent
-    found = sorted(directory.glob("seeds-*/config.json")) if directory.is_dir() else []
-    return [seeds for file in found if (seeds := seeds_of(file.parent))]
+    found = sorted(part_directory(part, options.preset, options.runs).glob("*/config.json"))
+    plans = [json.loads(file.read_text()).get("experiment", {}) for file in found]
+    return [tuple(plan["seeds"]) for plan in plans if plan]
 
 
 def checkpoints_of(
@@ -245,117 +250,132 @@ def checkpoints_of(
     """(seeds, checkpoints) of a finished source: our own runs, then those that were imported."""
     found = []
     for seeds in _begun(part, options):
-        directory = directory_of(part, options.preset, seeds, options.runs)
-        if (directory / "summary.json").exists():
-            found.append((seeds, directory / "checkpoints" / SOURCE))
+        run = finished_run(part, seeds, options)
+        if run.has_ended:
+            found.append((seeds, checkpoints_in(run.directory, part)))
     for file in sorted((results.directory / PROVENANCE).glob("*.json")):
         known = json.loads(file.read_text())
-        path = Path(known["run"]) / "checkpoints" / SOURCE
-        name = f"{part.experiment} {part.arm}"
-        if known["preset"] == options.preset and name in known["parts"] and path.is_dir():
+        path = checkpoints_in(Path(known["run"]), part)
+        is_of_it = known["preset"] == options.preset and str(part) in known["parts"]
+        if is_of_it and path.is_dir():
             found.append((tuple(known["seeds"]), path))
     return [pair for pair in found if checkpoint.latest(pair[1]) is not None]
+
+
+def finished_run(part: Part, seeds: Sequence[int], options: Options) -> FinishedRun:
+    """The run of a part with these seeds; it may not have ended, or begun."""
+    directory = run_directory(part, options.preset, seeds, options.runs)
+    return FinishedRun(directory, {part.arm.name: part})
+
+
+def num_devices(experiment: Experiment, options: Options) -> int:
+    """As many as are allowed and its seeds and environments spread over."""
+    (stage,) = experiment.stages
+    most = options.devices or len(parallel.available_devices())
+    return parallel.most_devices(len(experiment.seeds), stage.learner.num_envs, most)
 
 
 def train_part(
     part: Part, seeds: tuple[int, ...], source: Path | None, options: Options, results: Results
 ) -> None:
     """Runs a part, or goes on with it, unless it is finished; then keeps its rows."""
-    directory = directory_of(part, options.preset, seeds, options.runs)
-    name = f"{part.experiment} {part.arm}"
-    print(f"== {name}, preset {options.preset}, seeds {' '.join(map(str, seeds))}", flush=True)
-    if not (directory / "summary.json").exists():
-        config = config_of(part, options.budget, seeds, directory, source, options.devices)
-        note = Provenance.of([name], options.preset, seeds, directory)
+    print(f"== {part}, preset {options.preset}, seeds {' '.join(map(str, seeds))}", flush=True)
+    finished = finished_run(part, seeds, options)
+    note = Provenance.of([part], options.preset, seeds, finished.directory)
+    if not finished.has_ended:
+        experiment = experiment_of(part, options.budget, seeds, source)
         note.write(results.directory, {"command": command(), "commit": commit()})
         try:
-            run_experiment(config)
+            where = Where(devices=num_devices(experiment, options))
+            run_experiment(experiment, finished.directory, where)
         except StoppedError as error:
             # A part without an end is no curve; its file says why, and the others go on.
             note.write(results.directory, {"stopped": str(error)})
-            print(f"{name}: {error}", flush=True)
+            print(f"{part}: {error}", flush=True)
             return
-    results.add(FinishedRun(directory, {part.stage: (part.experiment, part.arm)}))
+    note.keep_plan(results.directory, finished.plan)
+    results.add(finished)
     results.write()
 
 
 def import_runs(options: Options, results: Results) -> None:
-    """Keeps the finished arms of runs that were made without this program."""
+    """Keeps the finished stages of runs that were made without this program."""
     found = [recognised(directory) for directory in options.import_runs]
     for finished in found:
         results.add(finished)
-        config = finished.config
-        parts = [" ".join(name) for name in finished.names.values()]
+        config, plan = finished.config, finished.plan
+        parts = list(finished.parts.values())
         about = {
             "command": shlex.join(["python", *config["command"]]),
             "commit": options.import_commit,
             "versions": config["versions"],
         }
-        note = Provenance.of(
-            parts,
-            config["options"]["preset"],
-            tuple(config["options"]["seeds"]),
-            finished.directory,
-        )
+        note = Provenance.of(parts, plan["preset"], tuple(plan["seeds"]), finished.directory)
         note.write(results.directory, about)
-        print(f"kept {', '.join(parts)} of {finished.directory}")
-        if changed := changed_settings(config["options"]):
-            print(f"  with another {', '.join(changed)} than preset {config['options']['preset']}")
+        note.keep_plan(results.directory, plan)
+        print(f"kept {', '.join(map(str, parts))} of {finished.directory}")
+        if changed := changed_settings(plan):
+            print(f"  with another {', '.join(changed)} than preset {plan['preset']}")
     results.write()
 
 
 def measure(options: Options, results: Results) -> None:
     """Table II for the chosen experiments, a row at a time."""
-    # Only this mode needs the learner itself.
-    from paper_speed import seconds_per_epoch
-
     seeds = (SPEED_SEED,)
     for part in parts_of(options.experiments, options.preset):
-        if part.changes or part.share != 1:
+        if part.arm not in TABLE_2:
             continue
         start = None
         if part.source is not None:
-            start = _start(seeds, checkpoints_of(Part(*part.source), options, results))
+            start = _start(seeds, checkpoints_of(part.source, options, results))
             if start is None:
-                print(f"{part.experiment} {part.arm}: no source to start from, left out")
+                print(f"{part}: no source to start from, left out")
                 continue
-        config = config_of(part, options.budget, seeds, options.runs, start, options.devices)
-        timed = seconds_per_epoch(config, part.stage, options.speed_epochs)
-        about = {"experiment": part.experiment, "arm": part.arm, "preset": options.preset}
+        experiment = experiment_of(part, options.budget, seeds, start)
+        devices = num_devices(experiment, options)
+        timed = seconds_per_epoch(experiment, options.runs, devices, options.speed_epochs)
+        about = {
+            "experiment": part.experiment,
+            "arm": part.arm.name,
+            "preset": options.preset,
+        }
         known = machine()
         where = {"machine": f"{known['processor']}, {known['cores']} cores", "commit": commit()}
         key = ("experiment", "arm", "preset")
         results.replace("seconds_per_epoch", [{**about, **timed, **where}], key)
         results.write()
-        print(f"{part.experiment} {part.arm}: {timed['seconds']:.3f} s per epoch", flush=True)
+        print(f"{part}: {timed['seconds']:.3f} s per epoch", flush=True)
 
 
 @dataclass(frozen=True)
 class Provenance:
     """Where the rows of a run come from: its file is added to each time the run goes on."""
 
-    parts: list[str]
+    parts: list[Part]
     preset: str
     seeds: tuple[int, ...]
     run: Path
 
     @classmethod
     def of(
-        cls, parts: list[str], preset: str, seeds: tuple[int, ...], directory: Path
+        cls, parts: list[Part], preset: str, seeds: tuple[int, ...], directory: Path
     ) -> "Provenance":
         return cls(parts, preset, seeds, directory.resolve())
 
-    def write(self, results: Path, session: dict[str, Any]) -> None:
-        """Adds a session: its command and commit, versions, machine and time."""
+    def file(self, results: Path) -> Path:
+        """Named after what the run trained: experiments with their arms, and seeds."""
         by_experiment: dict[str, list[str]] = {}
         for part in self.parts:
-            experiment, arm = part.split()
-            by_experiment.setdefault(experiment, []).append(arm)
+            by_experiment.setdefault(part.experiment, []).append(part.arm.name)
         names = "+".join(f"{name}-{'+'.join(arms)}" for name, arms in by_experiment.items())
         seeds = "-".join(map(str, self.seeds))
-        file = results / PROVENANCE / f"{self.preset}-{names}-seeds-{seeds}.json"
+        return results / PROVENANCE / f"{self.preset}-{names}-seeds-{seeds}.json"
+
+    def write(self, results: Path, session: dict[str, Any]) -> None:
+        """Adds a session: its command and commit, versions, machine and time."""
+        file = self.file(results)
         file.parent.mkdir(parents=True, exist_ok=True)
-        before = json.loads(file.read_text())["sessions"] if file.exists() else []
+        before = json.loads(file.read_text()) if file.exists() else {}
         now = {
             "versions": versions(),
             "machine": machine(),
@@ -363,32 +383,31 @@ class Provenance:
             "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             **session,
         }
-        write_json(
-            file,
-            {
-                "parts": self.parts,
-                "preset": self.preset,
-                "seeds": self.seeds,
-                "run": self.run,
-                "sessions": [*before, now],
-            },
-        )
+        about = {
+            "parts": [str(part) for part in self.parts],
+            "preset": self.preset,
+            "seeds": self.seeds,
+            "run": self.run,
+        }
+        write_json(file, {**before, **about, "sessions": [*before.get("sessions", []), now]})
+
+    def keep_plan(self, results: Path, plan: dict[str, Any]) -> None:
+        """Adds what was trained, resolved: tasks, starts and every setting of the learner."""
+        file = self.file(results)
+        write_json(file, {**json.loads(file.read_text()), "experiment": plan})
 
 
 def command() -> str:
     """As it can be typed again."""
-    return shlex.join(["python", *sys.argv])
+    return shlex.join(["python", "-m", "experiments.paper", *sys.argv[1:]])
 
 
 def main() -> None:
     """Reads the options and runs."""
     with plain_errors():
-        options = parse(Options, Options())
-        devices = options.devices or min(os.cpu_count() or 1, MAX_DEVICES)
+        options = parse(Options, Options(), prog="python -m experiments.paper")
         if not options.rebuild and not options.import_runs:
-            prepare_jax(devices)
+            keep_compiled()
+            # All at once: parts of other seeds spread over other numbers of them.
+            parallel.choose_devices(options.devices or parallel.usable_cores(), 1, options.devices)
         run(options)
-
-
-if __name__ == "__main__":
-    main()

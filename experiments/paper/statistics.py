@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from published import EXPERIMENTS, Experiment
 from scipy.stats import bootstrap, trim_mean
 
+from experiments.paper.arms import SCRATCH, SOURCE, TRANSFER, Arm
+from experiments.paper.published import EXPERIMENTS, PaperExperiment
 from sumajax.reporting.metrics import env_steps_to_threshold, seed_curves
 
 CONFIDENCE = 0.95
@@ -91,12 +92,12 @@ def estimate(statistic: Statistic, *samples: Sample) -> Estimate:
 
 
 @dataclass(frozen=True)
-class Arm:
+class Curves:
     """The curves of an arm: S seeds, E epochs."""
 
     rows: tuple[Row, ...]
-    row: Experiment
-    name: str
+    row: PaperExperiment
+    arm: Arm
     epochs: np.ndarray  # (E,)
     env_steps: np.ndarray  # (S, E)
     seconds: np.ndarray  # (S, E) of one seed: wall time over the seeds that trained side by side
@@ -105,11 +106,11 @@ class Arm:
     @property
     def hours(self) -> np.ndarray:
         """(E,) the paper's hours at the end of each epoch."""
-        return self.row.hours_of(self.name, 1) * self.epochs
+        return self.row.hours_of(self.arm.like, 1) * self.epochs
 
     @property
     def step_limit(self) -> int:
-        task = self.row.source if self.name.startswith("source") else self.row.target
+        task = self.row.source if self.arm.task == "source" else self.row.target
         return task.max_steps
 
     @cached_property
@@ -141,34 +142,34 @@ class Arm:
 
     def env_steps_to(self, threshold: float) -> Sample:
         """Environment steps of the arm until an epoch's mean is that low; never is infinite."""
-        found = env_steps_to_threshold(self.rows, self.name, threshold)
+        found = env_steps_to_threshold(self.rows, self.arm.name, threshold)
         return np.array([NEVER if steps is None else steps for steps in found], float)
 
 
-def arm_of(rows: Iterable[Row], experiment: str, arm: str, preset: str) -> Arm | None:
+def curves_of(rows: Iterable[Row], experiment: str, arm: Arm, preset: str) -> Curves | None:
     """An arm's curves from the kept rows, as far as all of its seeds go; None without any."""
-    wanted = (experiment, arm, preset)
+    wanted = (experiment, arm.name, preset)
     chosen = [r for r in rows if (r["experiment"], r["arm"], r["preset"]) == wanted]
     if not chosen:
         return None
     names = ("env_steps", "seconds", "steps_taken", "seeds_at_once")
-    epochs, values = seed_curves(chosen, arm, *names)
+    epochs, values = seed_curves(chosen, arm.name, *names)
     whole = np.isfinite(values["env_steps"]).all(axis=0)
     curves = {name: value[:, whole] for name, value in values.items()}
     curves["seconds"] = curves["seconds"] / curves.pop("seeds_at_once")
     row = EXPERIMENTS[experiment]
-    return Arm(tuple(chosen), row, arm, epochs[whole], **curves)
+    return Curves(tuple(chosen), row, arm, epochs[whole], **curves)
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Transfer against scratch, and what the transfer's source cost."""
 
-    row: Experiment
+    row: PaperExperiment
     preset: str
-    source: Arm
-    transfer: Arm
-    scratch: Arm
+    source: Curves
+    transfer: Curves
+    scratch: Curves
 
     @property
     def offset(self) -> float:
@@ -237,9 +238,9 @@ class Comparison:
 def comparison_of(rows: Iterable[Row], name: str, preset: str) -> Comparison | None:
     """Of an experiment; None while an arm is missing."""
     rows, row = list(rows), EXPERIMENTS[name]
-    source = arm_of(rows, row.source_of, "source", preset)
-    transfer = arm_of(rows, name, "transfer", preset)
-    scratch = arm_of(rows, name, "scratch", preset)
+    source = curves_of(rows, row.source_of, SOURCE, preset)
+    transfer = curves_of(rows, name, TRANSFER, preset)
+    scratch = curves_of(rows, name, SCRATCH, preset)
     if source is None or transfer is None or scratch is None:
         return None
     return Comparison(row, preset, source, transfer, scratch)

@@ -4,18 +4,19 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from paper_statistics import (
+from experiments.paper.arms import SOURCE, SOURCE_PLAIN
+from experiments.paper.published import EXPERIMENTS, LARGEST_RATIO, SOURCES
+from experiments.paper.statistics import (
     BEST_EPOCHS,
     Comparison,
     Estimate,
     Row,
-    arm_of,
     comparison_of,
+    curves_of,
     estimate,
     iqm,
     ratio_of,
 )
-from published import EXPERIMENTS, LARGEST_RATIO, SOURCES
 
 HOLDS, IN_PART, FAILS, NOT_RUN = "holds", "holds in part", "does not hold", "not run yet"
 
@@ -80,9 +81,9 @@ def claims(rows: Iterable[Row], preset: str) -> list[Claim]:
 
 def _source_unharmed(rows: list[Row], name: str, preset: str) -> Claim:
     row = EXPERIMENTS[name]
-    title = f"Q1, {row.title.rsplit(',', 1)[0]} on the source: upsampling does no harm"
+    title = f"Q1, {row.source_title} on the source: upsampling does no harm"
     claim = Claim(title, preset, "similar (no figure given)", "", NOT_RUN, "")
-    arms = [arm_of(rows, name, arm, preset) for arm in ("source", "source-plain")]
+    arms = [curves_of(rows, name, arm, preset) for arm in (SOURCE, SOURCE_PLAIN)]
     if any(arm is None for arm in arms):
         return claim
     lasts = [arm.last for arm in arms if arm is not None]

@@ -7,42 +7,31 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from paper_claims import NOT_RUN, RULES, Claim, claims, number, said
-from paper_figures import figure_2
-from paper_parts import ABLATED, Budget, Part, PresetName, unchanged_arms
-from paper_results import Results, write_csv
-from paper_statistics import (
+
+from experiments.paper.arms import ABLATIONS, SCRATCH, SOURCE, SOURCE_PLAIN, TABLE_2, TRANSFER, Arm
+from experiments.paper.claims import NOT_RUN, RULES, Claim, claims, number, said
+from experiments.paper.figures import figure_2
+from experiments.paper.parts import ABLATED, Budget, Part, PresetName, unchanged_arms
+from experiments.paper.published import EXPERIMENTS, SOURCES
+from experiments.paper.results import Results, write_csv
+from experiments.paper.statistics import (
     STATISTICS_COLUMNS,
     Comparison,
     Estimate,
     Row,
     aggregate,
-    arm_of,
     comparison_of,
+    curves_of,
     estimate,
     iqm,
     middle,
     ratio_of,
     statistics,
 )
-from published import EXPERIMENTS, SOURCES
-
 from sumajax.reporting import write_text
 
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 PROVENANCE = "provenance"
-
-VARIANTS = {
-    "transfer-corner": "(a) no upsampling: small state in a corner",
-    "transfer-mass": "(b) state scale `mass`",
-    "transfer-encoder": "(c) all but the state encoder",
-    "transfer-optimiser": "(d) optimiser state carried",
-    "transfer-25": "(e) source trained 25%",
-    "transfer-50": "(e) source trained 50%",
-    "transfer-lab-gap": "(f) encoder `lab_gap`, upsampled",
-    "transfer-lab-gap-native": "(f) encoder `lab_gap`, not upsampled",
-    "scratch-lab-gap": "(f) from scratch, encoder `lab_gap`",
-}
 
 
 def write_report(results: Results) -> None:
@@ -147,16 +136,18 @@ def table_2(measured: Iterable[Row]) -> list[dict[str, str]]:
     ours = {(row["experiment"], row["arm"], row["preset"]): row for row in measured}
     rows = []
     for name, row in EXPERIMENTS.items():
-        arms = ("source-plain", "source", "scratch", "transfer")
-        for arm in arms if name in SOURCES else arms[2:]:
-            paper = row.seconds[arm]
+        for arm in TABLE_2:
+            if arm.task == "source" and name not in SOURCES:
+                continue
+            paper = row.seconds[arm.like]
             cells = {
-                preset: _seconds(ours.get((name, arm, preset)), paper.mean) for preset in PRESETS
+                preset: _seconds(ours.get((name, arm.name, preset)), paper.mean)
+                for preset in PRESETS
             }
             rows.append(
                 {
-                    "experiment": row.title.rsplit(",", 1)[0] if "source" in arm else row.title,
-                    "arm": arm,
+                    "experiment": row.title if arm.task == "target" else row.source_title,
+                    "arm": arm.name,
                     "paper (s)": f"{paper.mean:.2f} ± {paper.error:.2f}",
                     **{f"ours, {preset} (s)": cell for preset, cell in cells.items()},
                 }
@@ -188,8 +179,8 @@ def _source_statistics(curves: list[Row], preset: str) -> list[Row]:
     """Question Q1: the source task with and without upsampling."""
     rows: list[Row] = []
     for name in SOURCES:
-        arms = {arm: arm_of(curves, name, arm, preset) for arm in ("source", "source-plain")}
-        lasts = {arm: found.last for arm, found in arms.items() if found is not None}
+        arms = {arm: curves_of(curves, name, arm, preset) for arm in (SOURCE, SOURCE_PLAIN)}
+        lasts = {arm.name: found.last for arm, found in arms.items() if found is not None}
         estimates = {arm: estimate(iqm, last) for arm, last in lasts.items()}
         if len(lasts) == 2:
             estimates["source/source-plain"] = estimate(ratio_of(iqm), *lasts.values())
@@ -242,9 +233,11 @@ def ablations(results: Results) -> list[dict[str, str]]:
     for preset in PRESETS:
         for name in ABLATED:
             transfer, scratch = unchanged_arms(name, preset)
-            unchanged = {transfer.arm: "as the paper (transfer)", scratch.arm: "from scratch"}
-            for arm, text in (unchanged | VARIANTS).items():
-                there = (name, arm, preset) in kept
+            variants = {"as the paper (transfer)": transfer, "from scratch": scratch}
+            for ablation in ABLATIONS.values():
+                variants |= ablation.variants
+            for text, arm in variants.items():
+                there = (name, arm.name, preset) in kept
                 if not there and preset not in presets(results):
                     continue
                 about = {"preset": preset, "experiment": EXPERIMENTS[name].title, "variant": text}
@@ -252,17 +245,16 @@ def ablations(results: Results) -> list[dict[str, str]]:
     return rows
 
 
-def _ablated(results: Results, name: str, arm: str, preset: str) -> dict[str, str]:
+def _ablated(results: Results, name: str, arm: Arm, preset: str) -> dict[str, str]:
     columns = ("seeds", "zero shot", "mean on the way", "at the end", "env steps to 20")
-    found = arm_of(results.rows["curves"], name, arm, preset)
+    found = curves_of(results.rows["curves"], name, arm, preset)
     if found is None:
         return dict.fromkeys(columns, NOT_RUN)
     looks = [
         row["steps_taken"]
         for row in results.rows["evaluations"]
         if (row["experiment"], row["preset"], row["mode"]) == (name, preset, "sampled")
-        and row["arm"] == arm.replace("transfer", "zero-shot")
-        and arm.startswith("transfer")
+        and row["arm"] == arm.zero_shot
     ]
     times = found.env_steps_to(20.0)
     reached = f"{int(np.isfinite(times).sum())} of {len(times)}"
@@ -285,7 +277,7 @@ def report(results: Results) -> str:
         by_name.setdefault(claim.name, []).append(claim)
     lines = [
         "# The paper's evidence, reproduced",
-        "Made by `python experiments/reproduce_paper.py --rebuild` from the CSV files beside it; "
+        "Made by `python -m experiments.paper --rebuild` from the CSV files beside it; "
         "nothing in it is written by hand. What was not run says so.",
         "## Claim by claim",
         markdown([_line(claim) for group in by_name.values() for claim in group]),
@@ -309,6 +301,8 @@ def report(results: Results) -> str:
         "## Budgets",
         _budgets(results, known),
         "## Commands",
+        "As they were given at their commits; the program was `experiments/reproduce_paper.py` "
+        "before it became `python -m experiments.paper`.",
         _commands(results.directory),
     ]
     return "\n\n".join(line.rstrip("\n") for line in lines) + "\n"
@@ -342,15 +336,15 @@ def _budgets(results: Results, known: Iterable[str]) -> str:
     """Epochs per arm: the paper's, those of `fast`, and those that the kept curves have."""
     rows = []
     for name, row in EXPERIMENTS.items():
-        for arm, epochs in row.epochs.items():
-            if arm.startswith("source") and name not in SOURCES:
+        for arm in (SOURCE, SOURCE_PLAIN, TRANSFER, SCRATCH):
+            if arm.task == "source" and name not in SOURCES:
                 continue
-            kept = {preset: results.last_epochs(name, arm, preset) for preset in known}
+            kept = {preset: results.last_epochs(Part(name, arm), preset) for preset in known}
             rows.append(
                 {
                     "experiment": row.title,
-                    "arm": arm,
-                    "preset paper": epochs,
+                    "arm": arm.name,
+                    "preset paper": Budget("paper").epochs(Part(name, arm)),
                     "preset fast": Budget("fast").epochs(Part(name, arm)),
                     "kept": "; ".join(_kept(*item) for item in kept.items() if item[1]) or NOT_RUN,
                 }

@@ -3,32 +3,34 @@
 import math
 import os
 import time
+from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
 import jax
 
-from sumajax.cli.transfer_config import SOURCE, TransferConfig
-from sumajax.experiment.run import Run
+from sumajax.experiment import Experiment
+from sumajax.experiment.run import Run, Where
 from sumajax.learning import parallel
-from sumajax.transfer import fresh_states, transferred_states
 
 
-def seconds_per_epoch(config: TransferConfig, arm: str, epochs: int) -> dict[str, Any]:
-    """Mean and standard error over `epochs` epochs, after one that does not count.
+def seconds_per_epoch(
+    experiment: Experiment, directory: Path, devices: int, epochs: int
+) -> dict[str, Any]:
+    """Mean and standard error over `epochs` epochs of a stage, after one that does not count.
 
     Compilation is apart; the policy trains on from epoch to epoch, as it does in a run.
+
+    Args:
+      experiment: of one stage.
+      directory: of a run, in which nothing is written.
     """
     load = os.getloadavg()[0]
-    run = Run.of(config)
-    stage = run.stage(arm)
-    source = config.source_checkpoint
-    if arm == SOURCE or source is None:
-        states = fresh_states(stage)
-    else:
-        states = transferred_states(stage, source)
-    states = parallel.place(states, run.mesh)
-    train = parallel.compile_train(stage.learner, run.mesh, 1, states)
+    run = Run(experiment, directory, Where(devices))
+    (stage,) = experiment.stages
+    mesh = run.mesh(stage)
+    states = parallel.place(run.first_states(stage), mesh)
+    train = parallel.compile_train(run.stage_run(stage).learner, mesh, 1, states)
     seconds = []
     for _ in range(epochs + 1):
         began = time.perf_counter()

@@ -1,0 +1,100 @@
+"""Tables, figures and report, from kept files alone."""
+
+import shutil
+
+import pytest
+
+from experiments.paper.claims import NOT_RUN
+from experiments.paper.program import Options, run
+from experiments.paper.published import EXPERIMENTS
+from experiments.paper.report import on_the_way, report, statistics_rows, table_1, table_2
+from experiments.paper.results import KEY, Results
+
+from .rows import RESULTS, arms
+
+IC3NET = EXPERIMENTS["pp-ic3net"]
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """Results of two experiments, on file."""
+    results = Results.read(tmp_path / "results")
+    rows = arms(
+        "pp-ic3net",
+        "fast",
+        source=[[50, 6]] * 3,
+        source_plain=[[50, 5]] * 3,
+        transfer=[[60, 20], [50, 18], [40, 22]],
+        scratch=[[199, 150], [198, 140], [197, 160]],
+    )
+    rows += arms("pcp-hetnet-2p1c", "fast", source=[[50, 6]] * 3, scratch=[[199, 190]] * 3)
+    results.replace("curves", rows, KEY)
+    level = {"random_steps_taken": 198.0, "random_success": 0.04, "shortest_paths": 10.5}
+    results.replace(
+        "references",
+        [{"experiment": "pp-ic3net", "task": "target", **level}],
+        ("experiment", "task"),
+    )
+    timed = {"epochs": 100, "seconds": 0.5, "standard_error": 0.01, "load_before": 0.0}
+    about = {"experiment": "pp-ic3net", "arm": "scratch", "preset": "fast"}
+    where = {"machine": "two cores", "commit": "abc"}
+    results.replace("seconds_per_epoch", [{**about, **timed, **where}], ("experiment", "arm"))
+    results.write()
+    return results
+
+
+def test_kept_files_are_read_as_they_were_written(kept):
+    assert Results.read(kept.directory).rows == kept.rows
+
+
+def test_everything_is_made_again_from_them(kept):
+    run(Options(rebuild=True, output=kept.directory))
+    names = {path.name for path in kept.directory.iterdir()}
+    tables = {f"{t}.{end}" for t in ("table1", "table2", "ablations") for end in ("md", "csv")}
+    assert names >= tables | {"statistics.csv", "statistics.md", "README.md"}
+    assert (kept.directory / "figure2-fast.png").read_bytes()[:4] == b"\x89PNG"
+    assert "figure2-paper.png" not in names
+    assert ".lock" not in names
+    again = report(Results.read(kept.directory))
+    assert (kept.directory / "README.md").read_text() == again
+
+
+def test_what_is_not_run_says_so(kept):
+    rows = {(row["experiment"], row["preset"]): row for row in table_1(kept.rows["curves"])}
+    assert rows[IC3NET.title, "paper"]["ratio"] == NOT_RUN
+    assert rows[EXPERIMENTS["pcp-hetnet-2p1c"].title, "fast"]["transfer"] == NOT_RUN
+    ours = rows[IC3NET.title, "fast"]
+    assert ours["scratch"].startswith("174.0 [")  # the mean of both epochs of 199 and 150, ...
+    timed = table_2(kept.rows["seconds_per_epoch"])[2]
+    assert timed["paper (s)"] == "143.13 ± 0.51"
+    assert timed["ours, fast (s)"] == "0.500 ± 0.010 (286x as fast)"
+    assert timed["ours, paper (s)"] == NOT_RUN
+
+
+def test_both_arms_at_equal_steps(kept):
+    (uncounted, counted) = on_the_way(kept.rows["curves"])
+    assert uncounted["source"] == "not counted"
+    assert set(counted.values()) >= {"-"}
+
+
+def test_the_aggregate_is_between_a_random_policy_and_the_bound(kept):
+    scores = [r for r in statistics_rows(kept) if r["quantity"] == "score at the hour"]
+    assert [row["of"] for row in scores] == ["scratch", "transfer"]
+    assert 0 < scores[0]["value"] < scores[1]["value"] < 1
+
+
+def test_the_kept_results_are_what_their_files_say(tmp_path):
+    """The tables and figures in the repository, made again from the files beside them."""
+    ours = tmp_path / "results"
+    shutil.copytree(RESULTS, ours)
+    for made in [*ours.glob("*.md"), *ours.glob("*.png")]:
+        made.unlink()
+    run(Options(rebuild=True, output=ours))
+    before, after = (
+        {path.name: path for path in directory.glob("*.*") if not path.name.startswith(".")}
+        for directory in (RESULTS, ours)
+    )
+    assert before.keys() == after.keys()
+    for name in before:
+        if not name.endswith(".png"):  # whose bytes are matplotlib's
+            assert after[name].read_text() == before[name].read_text(), name
