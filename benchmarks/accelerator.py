@@ -54,6 +54,7 @@ from sumajax.evaluation import EPISODES, evaluate
 from sumajax.learning import EPOCH_STEPS, Learner, make_learner, parallel, preset
 from sumajax.learning.learner import Metrics, TrainState
 from sumajax.learning.parallel import Execution
+from sumajax.learning.scaling import for_stage
 from sumajax.policies import POLICIES, make_policy
 from sumajax.precision import MATRIX_PRECISION
 from sumajax.upsampling import StateUpsampled
@@ -572,15 +573,16 @@ def main_job(options: "Options") -> list[Leg]:
     first, then = options.epochs[:2] if options.epochs else ((1, 1) if options.small else (40, 80))
     source, target = StateUpsampled(small, large.state_shape[1:]), large
     settings = preset("fast", "ic3net", **config)
-    gentle = replace(settings, learning_rate=settings.learning_rate * settings.transfer_rate)
 
-    def learner(env: Environment, config: Any) -> Learner:
-        return make_learner(env, make_policy("ic3net", env, **shape), config)
+    def leg(name: str, env: Environment, epochs: int, follows: str | None = None) -> Leg:
+        trained_with = for_stage(settings, env, epochs, transferred=follows is not None)
+        learner = make_learner(env, make_policy("ic3net", env, **shape), trained_with)
+        return Leg(name, learner, epochs, follows)
 
     return [
-        Leg("source", learner(source, settings), first),
-        Leg("transfer", learner(target, gentle), then, "source"),
-        Leg("scratch", learner(target, settings), then),
+        leg("source", source, first),
+        leg("transfer", target, then, "source"),
+        leg("scratch", target, then),
     ]
 
 
@@ -597,9 +599,9 @@ def chain_job(options: "Options") -> list[Leg]:
             task = PredatorPrey(size, numbers[0], vision=1, max_steps=limit)
         if size != options.sizes[-1]:
             task = StateUpsampled(task, options.sizes[-1])
-        rate = settings.learning_rate * (settings.transfer_rate if i else 1.0)
-        policy = make_policy(options.policy, task, **(SMALL_POLICY if options.small else {}))
-        learner = make_learner(task, policy, replace(settings, learning_rate=rate))
+        policy = make_policy(options.policy, task, **options.policy_settings)
+        trained_with = for_stage(settings, task, options.epochs[i], transferred=i > 0)
+        learner = make_learner(task, policy, trained_with)
         follows = legs[-1].name if legs else None
         legs.append(Leg(f"stage{i + 1}-{size}x{size}", learner, options.epochs[i], follows))
     return legs
@@ -622,6 +624,7 @@ class Options:
     epochs: tuple[int, ...] = ()
     episodes: int = EPISODES
     settings: dict[str, Any] = field(default_factory=dict)
+    policy_settings: dict[str, Any] = field(default_factory=dict)
     unroll: int | None = None
     xla: dict[str, Any] = field(default_factory=dict)
     cache: Path | None = None
@@ -671,6 +674,7 @@ def parsed(arguments: list[str] | None = None) -> Options:
         add(f"--{name}", type=int, nargs="+", default=[], help=words)
     add("--episodes", type=int, default=EPISODES, help="held-out episodes of each seed")
     add("--settings", type=setting, nargs="+", default=[], help="of a chain's learner, NAME=VALUE")
+    add("--policy-settings", type=setting, nargs="+", default=[], help="of a chain, NAME=VALUE")
     add("--unroll", type=int, help="steps in a turn of the rollout's loop; the backend's own")
     add("--xla", type=setting, nargs="+", default=[], help="options of XLA's, NAME=VALUE")
     add("--cache", type=Path, help="directory of compiled programs; compiled in the output")
@@ -688,6 +692,7 @@ def parsed(arguments: list[str] | None = None) -> Options:
         policy=given.policy,
         episodes=given.episodes,
         settings=dict(given.settings),
+        policy_settings=dict(given.policy_settings),
         unroll=given.unroll,
         xla=dict(given.xla),
         cache=given.cache,

@@ -16,6 +16,7 @@ from sumajax.description import describe_task
 from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES
 from sumajax.learning import LearnerConfig
+from sumajax.learning.scaling import for_stage
 from sumajax.policies import Policy, make_policy
 
 MAX_EPOCHS = 100_000
@@ -65,8 +66,9 @@ class Stage:
 
     @property
     def trained_with(self) -> LearnerConfig:
-        """The learner's settings with the length of this stage and its start worked in."""
-        return self.learner.for_stage(self.epochs, transferred=self.start is not None)
+        """The learner's settings with this stage's length, start and task worked in."""
+        transferred = self.start is not None
+        return for_stage(self.learner, self.env, self.epochs, transferred=transferred)
 
 
 @dataclass(frozen=True)

@@ -376,8 +376,8 @@ def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None 
     """The learner of `policy` on `env`; `config` defaults to the preset `fast`.
 
     Raises:
-      ValueError: when the policy was shaped for another task, the loss does not fit the task, or the
-        policy does not say which parameters are the critic's where the critic is to learn alone.
+      ValueError: when the policy was shaped for another task, the loss does not fit the task, or
+        the policy does not say which parameters are the critic's and the critic is to learn alone.
     """
     policy.check_fits(env)
     config = config or LearnerConfig()

@@ -37,6 +37,18 @@ def share_of_reference(env: Environment) -> float:
     return min(1.0, REFERENCE_DECISIONS / (env.num_agents * crossing(env)))
 
 
+def for_stage(
+    config: LearnerConfig, env: Environment, epochs: int, *, transferred: bool = False
+) -> LearnerConfig:
+    """What is trained in a stage of so many epochs on `env`, ready for `make_learner`.
+
+    Args:
+      transferred: it starts from parameters that were trained on another task.
+    """
+    config = config.for_stage(epochs, transferred=transferred)
+    return after_transfer(config, env) if transferred else config
+
+
 def after_transfer(config: LearnerConfig, env: Environment) -> LearnerConfig:
     """The settings of a stage on `env` that starts from a trained policy, of `for_stage`'s.
 

@@ -3,6 +3,7 @@
 A policy of your own needs no entry here: `Policy("mine", MyModule(TeamSpec.of(env)))` is one.
 """
 
+from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin
 
 from sumajax.environments.types import Environment
@@ -41,7 +42,7 @@ def make_policy(name: str, env: Environment, **settings: Any) -> Policy:
     if name not in POLICIES:
         raise ValueError(f"policy {name!r} is unknown; choose one of {', '.join(POLICIES)}.")
     module, variant = POLICIES[name]
-    known = set(module.__dataclass_fields__) - {"team", "parent", "name"} - set(variant)
+    known = {f.name for f in fields(module) if f.init} - {"team", "parent", "name"} - set(variant)
     unknown = sorted(set(settings) - known)
     if unknown:
         raise ValueError(
