@@ -1,10 +1,11 @@
 """No random key is used twice, as JAX's own checker sees it: it reads programs, and runs none."""
 
 import jax
+import jax.numpy as jnp
 import pytest
 from jax.experimental.key_reuse._core import check_key_reuse
 
-from sumajax.environments import PredatorCapturePrey
+from sumajax.environments import PredatorCapturePrey, TrafficJunction
 from sumajax.learning import make_learner, preset
 from sumajax.learning.rollout import draw
 from sumajax.policies import make_policy
@@ -53,3 +54,15 @@ def test_updates(settings, key):
 
     check_key_reuse(trained.init, key)
     check_key_reuse(two_updates, state)
+
+
+def test_a_step_with_arrivals(key):
+    junction = TrafficJunction(num_cars=2)
+
+    def steps(key):
+        state = junction.reset(key)
+        for _ in range(2):
+            state, _ = junction.step(state, jnp.zeros(2, jnp.int32))
+        return state
+
+    check_key_reuse(steps, key)

@@ -75,6 +75,9 @@ class Lottery:
     def active(self, state):
         return jnp.ones(2, bool)
 
+    def alive(self, state):
+        return jnp.ones(2, bool)
+
 
 ENV = Lottery()
 STEPS, ENVS = 7, 4  # more than two episodes

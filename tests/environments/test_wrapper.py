@@ -71,9 +71,9 @@ def test_what_no_contract_knows_is_the_tasks_own(wrap):
 @each_wrapper
 def test_what_the_task_does_not_have_the_wrapper_has_not(wrap):
     env = wrap(TASK)
-    assert not hasattr(env, "alive")
-    with pytest.raises(AttributeError, match="alive"):
-        env.alive(None)
+    assert not hasattr(env, "colour")
+    with pytest.raises(AttributeError, match="colour"):
+        env.colour  # noqa: B018
 
 
 @each_wrapper
