@@ -301,7 +301,8 @@ def relive(
         return carry, (logits, output.value)
 
     steps = pieces.split((begins, before, noise))
-    beginning = policy.initial_carry(steps[0].shape[1:2])
+    # Each window begins with what was remembered then: this is for its shapes and types alone.
+    beginning = jax.tree.map(lambda x: x[0], steps[1].carry)
     _, again = jax.lax.scan(body, beginning, steps, unroll=unroll)
     logits, value = pieces.join(again)
     decisions = {
