@@ -115,6 +115,6 @@ def test_every_part_is_a_run_that_is_accepted(selection, tmp_path):
             (source,) = experiment_of(part.source, Budget("fast"), (0, 1), None).stages
             stage = replace(stage, start=source.name)
             experiment = replace(experiment, stages=(source, stage))
-        run = Run(experiment, tmp_path / "run", Where())
+        run = Run(experiment, tmp_path / "run", Where(devices=1))
         run.check()
         assert run.stage_run(stage).epochs == Budget("fast").epochs(part)
