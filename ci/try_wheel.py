@@ -4,6 +4,7 @@ python ci/try_wheel.py ENVIRONMENT/bin/sumajax
 """
 
 import json
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -13,7 +14,8 @@ from pathlib import Path
 CHAIN = (
     "transfer pp --sizes 5 10 20 --teams 3 5 10 --epochs 2 2 2 --scratch-epochs 2 "
     "--episodes 64 --output r"
-).split()
+)
+EVALUATE = "evaluate r --sizes 20 --teams 10 --episodes 64 --json e.json"
 PATIENCE = 1200
 """Seconds for a stage to have begun."""
 
@@ -22,17 +24,16 @@ def main(command: str) -> None:
     """Raises where anything is not as promised."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "r"
-        first = subprocess.Popen([command, *CHAIN], cwd=folder)
+        first = subprocess.Popen([command, *shlex.split(CHAIN)], cwd=folder)
         wait_for_second_stage(run / "metrics.csv", first)
         first.kill()
         first.wait()
         assert not (run / "summary.json").exists(), "killed before its end"
-        subprocess.run([command, *CHAIN], cwd=folder, check=True)
+        subprocess.run([command, *shlex.split(CHAIN)], cwd=folder, check=True)
         check_summary(json.loads((run / "summary.json").read_text()))
-        evaluate = "evaluate r --sizes 20 --teams 10 --episodes 64 --json e.json".split()
-        subprocess.run([command, *evaluate], cwd=folder, check=True)
+        subprocess.run([command, *shlex.split(EVALUATE)], cwd=folder, check=True)
         report = json.loads((Path(folder) / "e.json").read_text())
-        assert list(report["policies"])[0] == "20x20-10", report["policies"]
+        assert next(iter(report["policies"])) == "20x20-10", report["policies"]
 
 
 def wait_for_second_stage(metrics: Path, process: "subprocess.Popen[bytes]") -> None:

@@ -308,7 +308,7 @@ def _printable(sentence: str) -> str:
 def reason(error: BaseException) -> str:
     """The first line of an error, or what the system said at its root, without a full stop."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    if said := re.search(r"([^:]+) \[os_error_code=", text):  # of TensorStore
-        return said[1].strip()
+    if found := re.search(r"([^:]+) \[os_error_code=", text):  # of TensorStore
+        return found[1].strip()
     lines = text.strip().splitlines() or [type(error).__name__]
     return lines[0][:200].rstrip(". ")

@@ -224,12 +224,12 @@ def first_makes(work: Callable[[], tuple[T, Any]], like: Callable[[], Any]) -> t
         return work()
     made: list[Any] = []
 
-    def told() -> T:
+    def work_on_first() -> T:
         value, tree = work()
         made.append(tree)
         return value
 
-    value = first_does(told)
+    value = first_does(work_on_first)
     kinds = jax.eval_shape(_raw, like())
     sizes = [x.size * x.dtype.itemsize for x in jax.tree.leaves(kinds)]
     if made:

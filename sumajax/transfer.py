@@ -268,8 +268,8 @@ def run_stage(
         for stop in _new_stops(stage, news, stops):
             on_stop(stop)
             stops += (stop,)
-        told = {**description, "epoch": news.epoch, "stops": [asdict(stop) for stop in stops]}
-        if hosts.first_does(partial(_save, stage, whole, told, stop_asked)):
+        meta_now = {**description, "epoch": news.epoch, "stops": [asdict(stop) for stop in stops]}
+        if hosts.first_does(partial(_save, stage, whole, meta_now, stop_asked)):
             raise KeyboardInterrupt
     if len(stops) == num_seeds:
         raise StoppedError(
@@ -353,8 +353,8 @@ def _resumed(
         return (True, 0, []), start()
     like = jax.eval_shape(lambda: fresh_states(stage))
     states, meta = checkpoint.load(stage.directory, like)
-    told = (False, meta["epoch"], meta.get("stops", []))
-    return told, jax.tree.map(jnp.asarray, states)
+    resumed = (False, meta["epoch"], meta.get("stops", []))
+    return resumed, jax.tree.map(jnp.asarray, states)
 
 
 def _chunk_length(epochs: int, done: int, longest: int) -> int:

@@ -139,10 +139,10 @@ def available_devices() -> list[jax.Device]:
     try:
         return jax.local_devices()
     except (RuntimeError, AssertionError) as error:  # a bare assertion where no CUDA is found
-        said = (str(error).splitlines() or ["none is there"])[0]
+        why = (str(error).splitlines() or ["none is there"])[0]
         raise ValueError(
             f"JAX finds no device of the kind that JAX_PLATFORMS={_platforms()!r} asks "
-            f"for ({said}); unset JAX_PLATFORMS, or install what drives it."
+            f"for ({why}); unset JAX_PLATFORMS, or install what drives it."
         ) from None
 
 

@@ -177,14 +177,16 @@ def rollout(
       unroll: steps that one turn of the compiled loop takes; changes no result.
     """
     if detach_gap is None:
-        actors, (_, trajectory) = play(env, policy, params, actors, draws, unroll)
+        actors, (_, trajectory) = unroll_steps(env, policy, params, actors, draws, unroll)
         return actors, trajectory
     constant = jax.lax.stop_gradient(params)
-    actors, (before, trajectory) = play(env, policy, constant, actors, draws, unroll)
-    return actors, relive(env, policy, params, before, draws.noise, trajectory, detach_gap, unroll)
+    actors, (before, trajectory) = unroll_steps(env, policy, constant, actors, draws, unroll)
+    return actors, recompute_in_windows(
+        env, policy, params, before, draws.noise, trajectory, detach_gap, unroll
+    )
 
 
-def play(
+def unroll_steps(
     env: Environment, policy: Policy, params: Any, actors: Actors, draws: Draws, unroll: int = 1
 ) -> tuple[Actors, tuple[Actors, Trajectory]]:
     """`rollout` without a gap; and the actors before each step, leaves (T, E, ...).
@@ -265,7 +267,7 @@ def stagger(
     return jax.lax.scan(body, actors, jnp.arange(env.max_steps))[0]
 
 
-def relive(
+def recompute_in_windows(
     env: Environment,
     policy: Policy,
     params: Any,

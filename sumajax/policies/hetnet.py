@@ -88,7 +88,7 @@ class HetNetCarry:
 
 @struct.dataclass
 class Exchange:
-    """What was said in one layer."""
+    """The messages of one layer."""
 
     weights: dict[str, chex.Array]  # by relation with an edge: (..., receivers, senders, K)
     bits: chex.Array | None  # (..., N, bits) of 0 and 1, for binary messages
@@ -182,7 +182,7 @@ class HetLayer(nn.Module):
           folded: what `fold` returns, for who has it already.
 
         Returns:
-          the next layer's features by node, and what was said.
+          the next layer's features by node, and the messages.
         """
         num_p = features["P"].shape[-2]
         relations = present_relations(num_p, features["A"].shape[-2])
@@ -221,9 +221,9 @@ class HetLayer(nn.Module):
         if read == BITS:
             layers = ["dec_P", "dec_A"]
         else:
-            said = [r for r in relations if sender_of(r) == read and r in self.dense]
+            spoken_by = [r for r in relations if sender_of(r) == read and r in self.dense]
             code = [name for name in (f"enc_{read}",) if name in self.dense]
-            layers = [f"self_{read}", *said, *code]
+            layers = [f"self_{read}", *spoken_by, *code]
         readings: dict[str, tuple[str, chex.Array | None]] = {name: (name, None) for name in layers}
         for relation in relations:
             dst, src = self.vectors[relation]
@@ -338,7 +338,7 @@ class HetGraph(nn.Module):
 
         Returns:
           logits "P" (..., N_P, 5) and "A" (..., N_A, 6), value of each class (..., 2) or with
-          `critic="agent"` of each agent (..., N), and what was said in each layer.
+          `critic="agent"` of each agent (..., N), and the messages of each layer.
         """
         noises = (noise[..., 0, :, :], noise[..., 1, :, :]) if noise is not None else (None, None)
         layer1, layer2 = folded or (None, None)
@@ -481,7 +481,7 @@ class HetNet(PolicyModule):
 
 
 def team_descriptor(team: TeamSpec, meta: Meta) -> np.ndarray:
-    """(2, 4): what both state nodes are told about the team and its grid."""
+    """(2, 4): what both state nodes read about the team and its grid."""
     raw = [team.class_size(0), team.class_size(1), team.state_shape[-2], META_CONSTANT]
     scale = META_SCALE if meta == "normalised" else np.ones(META_FEATURES)
     return np.tile(np.array(raw) / np.array(scale), (2, 1))

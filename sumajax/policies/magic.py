@@ -162,9 +162,9 @@ class MAGICCore(nn.Module):
         """
         h, s = self.lstm.step_folded((carry.h, carry.s), projected, seen, folded["lstm"])
         there = None if alive is None else alive.astype(h.dtype)[..., None]  # (..., N, 1)
-        said = h if there is None else h * there
-        graphs = self._graphs(said, there, graph_noise, folded)
-        message, weights = self.gat1(said, graphs[..., 0, :, :], folded["gat1"])
+        messages = h if there is None else h * there
+        graphs = self._graphs(messages, there, graph_noise, folded)
+        message, weights = self.gat1(messages, graphs[..., 0, :, :], folded["gat1"])
         message, _ = self.gat2(nn.elu(message), graphs[..., -1, :, :], folded["gat2"])
         if there is not None:
             message = message * there
@@ -176,7 +176,7 @@ class MAGICCore(nn.Module):
 
     def _graphs(
         self,
-        said: chex.Array,
+        messages: chex.Array,
         there: chex.Array | None,
         noise: chex.Array | None,
         folded: dict[str, Any],
@@ -184,10 +184,10 @@ class MAGICCore(nn.Module):
         """(..., Q, N, N) 0/1: who hears whom, among those who are there."""
         pairs = None if there is None else there * jnp.swapaxes(there, -1, -2)  # (..., N, N)
         if not self.drawn:
-            shape = (*said.shape[:-1], said.shape[-2])
-            complete = jnp.ones(shape, said.dtype) if pairs is None else pairs
+            shape = (*messages.shape[:-1], messages.shape[-2])
+            complete = jnp.ones(shape, messages.dtype) if pairs is None else pairs
             return complete[..., None, :, :]
-        encoded, _ = self.gat_enc(said, pairs, folded["gat_enc"])
+        encoded, _ = self.gat_enc(messages, pairs, folded["gat_enc"])
         graphs = straight_through_bit(self.scheduler(encoded, folded["scheduler"]), noise)
         return graphs if pairs is None else graphs * pairs[..., None, :, :]
 

@@ -115,10 +115,14 @@ class TarMACCore(nn.Module):
             query = query + jnp.broadcast_to(folded["query_bias"], query.shape)
             weights = attend(query, key, talks, there)
             heard = jnp.einsum("...ij,...jh->...ih", weights, h)
-            silent, told = (jnp.broadcast_to(bias, x.shape) for bias in of_round["biases"])
+            state_bias, message_bias = (
+                jnp.broadcast_to(bias, x.shape) for bias in of_round["biases"]
+            )
             if talks is not None:
-                told = told * hears(talks, there)[..., None]
-            h, s = self.lstm.step_folded((h, s), x + silent + told, heard, of_round["heard"])
+                message_bias = message_bias * hears(talks, there)[..., None]
+            h, s = self.lstm.step_folded(
+                (h, s), x + state_bias + message_bias, heard, of_round["heard"]
+            )
             attention.append(weights)
         heads = [self.action, self.value, *([self.gate] if self.gated else [])]
         action, value, *gate = side_by_side(heads, h)

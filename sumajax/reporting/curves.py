@@ -84,8 +84,8 @@ def learning_curves(
     columns = [arm_curves(rows, name, y, after) for name in panels]
     if not columns[0]:
         raise ValueError(f"there is no {y} of any arm to draw.")
-    looks = _looks(list(columns[0]), after, labels or {})
-    figure = _draw(panels, columns, y, bounds or {}, looks, log_y)
+    styles = _styles(list(columns[0]), after, labels or {})
+    figure = _draw(panels, columns, y, bounds or {}, styles, log_y)
     _draw_legend(figure, columns[0], title)
     if output is not None:
         write_png(figure, output)
@@ -110,7 +110,7 @@ def arm_curves(
 
 
 @dataclass(frozen=True)
-class _Look:
+class _Style:
     """How an arm is drawn."""
 
     label: str
@@ -118,9 +118,9 @@ class _Look:
     style: Any
 
 
-def _looks(
+def _styles(
     arms: Sequence[str], after: Mapping[str, Sequence[str]], labels: Mapping[str, str]
-) -> dict[str, _Look]:
+) -> dict[str, _Style]:
     target = max(arms, key=lambda arm: len(after.get(arm, ())))
     before = [arm for arm in arms if arm in after.get(target, ())]
     rivals = [arm for arm in arms if arm not in (target, *before)]
@@ -128,7 +128,7 @@ def _looks(
     for group, palette in ((before, ON_THE_WAY_COLOURS), (rivals, RIVAL_COLOURS)):
         colours |= {arm: palette[place % len(palette)] for place, arm in enumerate(group)}
     return {
-        arm: _Look(labels.get(arm, arm), colours[arm], DASHED if arm in before else "-")
+        arm: _Style(labels.get(arm, arm), colours[arm], DASHED if arm in before else "-")
         for arm in arms
     }
 
@@ -171,14 +171,14 @@ def _draw(
     columns: Sequence[Mapping[str, Curve]],
     y: str,
     bounds: Mapping[str, float],
-    looks: Mapping[str, _Look],
+    styles: Mapping[str, _Style],
     log_y: bool | None,
 ) -> Figure:
     figure = Figure(figsize=(9.0 if len(panels) > 1 else 6.0, 3.9), dpi=200, layout="constrained")
     FigureCanvasAgg(figure)
     all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, name, curves in zip(all_axes, panels, columns, strict=True):
-        _draw_panel(axes, curves, name, looks)
+        _draw_panel(axes, curves, name, styles)
     all_axes[0].set_ylabel(Y_LABELS.get(y, y.replace("_", " ")), color=INK)
     _scale_y(all_axes[0], columns[0], y, bounds, log_y)
     for axes in all_axes:
@@ -187,7 +187,7 @@ def _draw(
 
 
 def _draw_panel(
-    axes: Axes, curves: Mapping[str, Curve], x: str, looks: Mapping[str, _Look]
+    axes: Axes, curves: Mapping[str, Curve], x: str, styles: Mapping[str, _Style]
 ) -> None:
     unit, label = _unit(x, max(curve.x.max() for curve in curves.values()))
     for arm, curve in curves.items():
@@ -196,19 +196,19 @@ def _draw_panel(
                 curve.x / unit,
                 curve.low,
                 curve.high,
-                color=looks[arm].colour,
+                color=styles[arm].colour,
                 alpha=0.2,
                 linewidth=0,
             )
         axes.plot(
             curve.x / unit,
             curve.middle,
-            color=looks[arm].colour,
-            linestyle=looks[arm].style,
+            color=styles[arm].colour,
+            linestyle=styles[arm].style,
             linewidth=1.6,
             marker="o" if len(curve.x) == 1 else None,
             markersize=4,
-            label=looks[arm].label,
+            label=styles[arm].label,
         )
     dress(axes, label)
 

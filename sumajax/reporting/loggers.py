@@ -135,9 +135,9 @@ class WeightsAndBiases:
                 resume="allow",
             )
         except Exception as error:  # its own, the network's, the login's: there is no common kind
-            said = " ".join(str(error).split()) or type(error).__name__
+            why = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(
-                f"Weights & Biases starts no run ({said.rstrip('.')}); run `wandb login` or set "
+                f"Weights & Biases starts no run ({why.rstrip('.')}); run `wandb login` or set "
                 "WANDB_API_KEY, set WANDB_MODE=offline to keep the run here, or leave wandb out of "
                 "--log."
             ) from None
