@@ -8,7 +8,7 @@ sumajax evaluate runs/mine/checkpoints/transfer --modes greedy --replay best.gif
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,7 +28,7 @@ from sumajax.cli.domains import (
 )
 from sumajax.cli.options import keep_compiled, parse, plain_errors
 from sumajax.environments.types import Environment
-from sumajax.environments.wrapper import unwrapped
+from sumajax.environments.wrapper import rewrapped, unwrapped
 from sumajax.evaluation import EPISODES, Agent, load_agent, shortest_path_steps
 from sumajax.experiment.records import EVALUATION_SEED, held_out
 from sumajax.keys import key_of
@@ -84,12 +84,9 @@ class Trained:
         Raises:
           ValueError: when it does not fit; names both values.
         """
-        trained_on = self.agents[0].env
         try:
-            env: Any = task
-            if isinstance(trained_on, StateUpsampled):
-                env = replace(trained_on, env=task)
-            elif task.shape != self.grid:
+            env: Any = rewrapped(self.agents[0].env, task)
+            if env is task and task.shape != self.grid:
                 env = StateUpsampled(task, self.grid)
         except ValueError:
             mine, theirs = grid_label(self.grid), grid_label(task.shape)

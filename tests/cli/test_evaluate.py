@@ -174,3 +174,13 @@ def test_help_is_readable(capsys):
     assert stop.value.code == 0
     for option in ("PATH", "--sizes", "--teams", "--arms", "--seeds", "--json", "--replay"):
         assert option in text
+
+
+def test_a_corner_source_is_evaluated_as_a_corner(tmp_path):
+    """In the wrapper that it was trained in, whatever the task."""
+    corner = StateUpsampled(SMALL, 6, fill="corner")
+    save(tmp_path / "corner", corner, "source", seeds=(0,))
+    (trained,) = program.load(program.EvaluateConfig(tmp_path / "corner"))
+    assert trained.on(SMALL)[0] == corner
+    other = PredatorPrey(size=2, num_predators=2)
+    assert trained.on(other)[0] == StateUpsampled(other, 6, fill="corner")
