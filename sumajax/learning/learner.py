@@ -376,8 +376,7 @@ def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None 
     """The learner of `policy` on `env`; `config` defaults to the preset `fast`.
 
     Raises:
-      ValueError: when the policy was shaped for another task, the loss does not fit the task, or
-        the policy does not say which parameters are the critic's and the critic is to learn alone.
+      ValueError: when the policy was shaped for another task, or the loss does not fit the task.
     """
     policy.check_fits(env)
     config = config or LearnerConfig()
@@ -385,9 +384,6 @@ def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None 
         raise ValueError(
             "loss 'hetnet' has no place for agents that come and go; use loss 'actor_critic'."
         )
-    if config.critic_epochs and not policy.module.critic_parameters:
-        raise ValueError(
-            f"critic_epochs {config.critic_epochs} needs to know what is the critic's alone: name "
-            f"it in critic_parameters of {type(policy.module).__name__}, or set critic_epochs to 0."
-        )
+    if not policy.module.critic_parameters:  # a policy that does not say what its critic's is
+        config = replace(config, critic_epochs=0)
     return Learner(env, policy, config)

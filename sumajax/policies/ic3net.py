@@ -4,7 +4,7 @@ Agents pass the mean of each other's hidden states through a dense layer into a 
 IC3Net each agent also decides, by a gate sampled one step ahead, whether it takes part at all.
 """
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import chex
 import jax
@@ -17,8 +17,6 @@ from sumajax.policies.encoder import EncoderKind, ObservationEncoder
 from sumajax.policies.layers import Dense, LSTMCell, lift, side_by_side
 from sumajax.policies.types import Decision, PolicyModule, PolicyOutput, decide, mask_actions
 from sumajax.records import exportable
-
-Message = Literal["mean", "root", "talking"]
 
 SILENT, TALK = 0, 1
 
@@ -41,7 +39,6 @@ class IC3NetCore(nn.Module):
     communicates: bool = True
     gated: bool = True
     comm_passes: int = 1
-    message: Message = "mean"
 
     def setup(self) -> None:
         passes = self.comm_passes if self.communicates else 0
@@ -58,7 +55,7 @@ class IC3NetCore(nn.Module):
         """x (..., N, H), alive (..., N) -> h, s, logits by decision, value (..., N)."""
         h, s = carry.h, carry.s
         for message_layer in self.C:
-            heard = mean_message(h, carry.gate, alive, self.message)
+            heard = mean_message(h, carry.gate, alive)
             h, s = self.lstm((h, s), x + message_layer(heard))
         if not self.communicates:
             h, s = self.lstm((h, s), x)
@@ -68,24 +65,16 @@ class IC3NetCore(nn.Module):
         return h, s, logits, value[..., 0]
 
 
-def mean_message(
-    h: chex.Array, gate: chex.Array, alive: chex.Array | None = None, kind: Message = "mean"
-) -> chex.Array:
-    """(..., N, H): what each agent hears, the sum over talking others of h, divided.
+def mean_message(h: chex.Array, gate: chex.Array, alive: chex.Array | None = None) -> chex.Array:
+    """(..., N, H): what each agent hears, sum over talking others of h / (number of others).
 
     A silent agent hears nothing either (the published program; the paper's formula gates the sender
-    only), and who is not there neither speaks nor hears.
-
-    Args:
-      kind: what the sum is divided by: `mean` N - 1, all others who are there and not only those
-        who talk, as published; `root` its square root; `talking` the number of others who talk.
+    only), and the mean is over all others who are there, not over those who talk. Who is not there
+    neither speaks nor hears.
     """
     gate, others = talking(gate, alive), count_others(gate, alive)
     spoken = gate[..., None] * h
-    heard = gate[..., None] * (spoken.sum(-2, keepdims=True) - spoken)
-    if kind == "talking":
-        return heard / jnp.maximum(gate.sum(-1, keepdims=True) - gate, 1.0)[..., None]
-    return heard / (others if kind == "mean" else others**0.5)
+    return gate[..., None] * (spoken.sum(-2, keepdims=True) - spoken) / others
 
 
 def talking(gate: chex.Array, alive: chex.Array | None) -> chex.Array:
@@ -115,7 +104,6 @@ class IC3Net(PolicyModule):
     communicates: bool = True
     gated: bool = True
     comm_passes: int = 1
-    message: Message = "mean"
     encoder: EncoderKind = "flat"
     talk_always: bool = False
     fresh_memory: bool = False
@@ -130,7 +118,6 @@ class IC3Net(PolicyModule):
             self.communicates,
             self.gated,
             self.comm_passes,
-            self.message,
         )
 
     def encode_states(self, states: chex.Array | SparseStates) -> chex.Array:

@@ -7,7 +7,7 @@ ahead. This is the form of the published program of MAGIC's baselines, which ada
 first author: the LSTM runs once per round of messages.
 """
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import chex
 import jax
@@ -184,6 +184,8 @@ class TarMAC(PolicyModule):
     score_scale: ScoreScale = "hidden"
     talk_always: bool = False
     fresh_memory: bool = False
+
+    critic_parameters: ClassVar[frozenset[str]] = frozenset({"value"})
 
     def setup(self) -> None:
         self.observation = ObservationEncoder(self.hidden, self.encoder)

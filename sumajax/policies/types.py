@@ -105,7 +105,8 @@ class PolicyModule(nn.Module, ABC):
 
     critic_parameters: ClassVar[frozenset[str]] = frozenset()
     """Names of modules and parameters that nothing but the value depends on: what can learn while
-    the policy stays as it is (`LearnerConfig.critic_epochs`)."""
+    the policy stays as it is (`LearnerConfig.critic_epochs`). Where none are named all parameters
+    learn from the start."""
 
     @abstractmethod
     def encode_states(self, states: chex.Array) -> chex.Array:

@@ -315,13 +315,11 @@ class TestCriticAlone:
         for a, b in zip(*map(jax.tree.leaves, (held.params, after.params)), strict=True):
             assert (a != b).any()
 
-    def test_a_policy_that_names_no_critic_is_refused(self):
+    def test_a_policy_that_names_no_critic_learns_as_a_whole(self):
         policy = make_policy("iric", TINY_TASK)
         nameless = replace(policy, module=Nameless(team=policy.team, communicates=False))
         config = preset("fast", critic_epochs=1)
-        with pytest.raises(ValueError, match="critic_parameters"):
-            make_learner(TINY_TASK, nameless, config)
-        make_learner(TINY_TASK, nameless)
+        assert make_learner(TINY_TASK, nameless, config).config == preset("fast")
 
 
 class Nameless(IC3Net):
