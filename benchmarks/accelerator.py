@@ -39,7 +39,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,7 @@ from sumajax.learning.parallel import Execution
 from sumajax.learning.scaling import for_stage
 from sumajax.policies import POLICIES, make_policy
 from sumajax.precision import MATRIX_PRECISION
-from sumajax.upsampling import StateUpsampled
+from sumajax.upsampling import Scale, StateUpsampled
 
 JOBS = ("all", "table", "main", "chain")
 SECONDS = 420.0
@@ -598,7 +598,7 @@ def chain_job(options: "Options") -> list[Leg]:
         else:
             task = PredatorPrey(size, numbers[0], vision=1, max_steps=limit)
         if size != options.sizes[-1]:
-            task = StateUpsampled(task, options.sizes[-1])
+            task = StateUpsampled(task, options.sizes[-1], options.scale)
         policy = make_policy(options.policy, task, **options.policy_settings)
         trained_with = for_stage(settings, task, options.epochs[i], transferred=i > 0)
         learner = make_learner(task, policy, trained_with)
@@ -625,6 +625,7 @@ class Options:
     episodes: int = EPISODES
     settings: dict[str, Any] = field(default_factory=dict)
     policy_settings: dict[str, Any] = field(default_factory=dict)
+    scale: Scale = "none"
     unroll: int | None = None
     xla: dict[str, Any] = field(default_factory=dict)
     cache: Path | None = None
@@ -675,6 +676,7 @@ def parsed(arguments: list[str] | None = None) -> Options:
     add("--episodes", type=int, default=EPISODES, help="held-out episodes of each seed")
     add("--settings", type=setting, nargs="+", default=[], help="of a chain's learner, NAME=VALUE")
     add("--policy-settings", type=setting, nargs="+", default=[], help="of a chain, NAME=VALUE")
+    add("--scale", choices=get_args(Scale), default="none", help="of a chain's upsampled states")
     add("--unroll", type=int, help="steps in a turn of the rollout's loop; the backend's own")
     add("--xla", type=setting, nargs="+", default=[], help="options of XLA's, NAME=VALUE")
     add("--cache", type=Path, help="directory of compiled programs; compiled in the output")
@@ -693,6 +695,7 @@ def parsed(arguments: list[str] | None = None) -> Options:
         episodes=given.episodes,
         settings=dict(given.settings),
         policy_settings=dict(given.policy_settings),
+        scale=given.scale,
         unroll=given.unroll,
         xla=dict(given.xla),
         cache=given.cache,
