@@ -23,7 +23,7 @@ FOLLOWED = 0
 """The agent whose state is shown."""
 SOURCE = {"agents": [(3, 1), (0, 3), (4, 4)], "prey": (1, 1)}
 TARGET = {"agents": [(6, 3), (1, 8), (8, 8), (3, 5), (9, 1)], "prey": (2, 2)}
-WIDTH, HEIGHT, DPI = 7.2, 4.7, 150
+WIDTH, HEIGHT, DPI = 6.2, 4.05, 170
 """Inches: small, so that the words are still read on a telephone."""
 BOX = (0.79, 0.2, 0.2, 0.58)
 """Of the policy: left, bottom, width, height, as shares of the figure."""
@@ -134,7 +134,7 @@ def _task(
     for row, column in agents:
         corner = (column - VISION, row - VISION)
         axes.add_patch(Rectangle(corner, side, side, color=colours.sight, alpha=0.7, zorder=0))
-    area = (110 / size) ** 2
+    area = (95 / size) ** 2
     for place, (row, column) in enumerate(agents):
         edge = colours.ink if place == FOLLOWED else "none"
         axes.scatter(column + 0.5, row + 0.5, area * 0.42, colours.agent, edgecolors=edge, zorder=3)
@@ -155,9 +155,9 @@ def _box(figure: Figure, colours: Colours) -> None:
         )
     )
     words = {
-        0.80: ("pre-train", 12.5, "normal"),
-        0.56: (f"one policy,\nreads {LARGE}x{LARGE}", 12.5, "bold"),
-        0.17: ("train on", 12.5, "normal"),
+        0.80: ("pre-train", 12, "normal"),
+        0.56: (f"one policy,\nreads {LARGE}x{LARGE}", 11.5, "bold"),
+        0.17: ("train on", 12, "normal"),
     }
     middle = left + width / 2
     for height_share, (text, size, weight) in words.items():
