@@ -1,11 +1,31 @@
 """The pages in docs/: their code runs, in the order it stands, and their links lead somewhere."""
 
+import json
+import os
 import re
+import runpy
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parents[1] / "docs"
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "CONTRIBUTING.md"]
+CODE = ("sumajax", "experiments", "benchmarks", "tests")
+CITATION = re.compile(r"(?<!'s )\b(docs/(?:reference/)?\w+\.md)(?:, ([A-Z][^).:;]*))?")
+"""Of a page of this repository, and of a section in it."""
+
+
+def test_start(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", (DOCS / "index.md").read_text(), re.DOTALL)
+    shared: dict = {}
+    exec(compile(code, "index.md", "exec"), shared)
+    assert shared["metrics"].env_steps.tolist() == [20_000]
+    assert shared["zero_shot"].steps_taken.shape == (128,)
+    assert capsys.readouterr().out
 
 
 def test_extending(capsys, tmp_path, monkeypatch):
@@ -29,9 +49,68 @@ def test_jaxmarl(capsys):
     assert capsys.readouterr().out == "(43,) False [False False False]\n"
 
 
-@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links(page):
-    for link in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text()):
-        assert (DOCS / link).exists(), link
-    for file in re.findall(r"`((?:sumajax|experiments|tests)/[\w/.]+)`", page.read_text()):
-        assert (DOCS.parent / file).exists(), file
+    text = page.read_text()
+    for link, section in re.findall(r"\]\((?!https?:)([^)#\s]*)(?:#([^)]*))?\)", text):
+        to = (page.parent / link) if link else page
+        assert to.exists(), link
+        if section and to.suffix == ".md":
+            assert section in {anchor(name) for name in headings(to)}, f"{link}#{section}"
+    for file in re.findall(r"`((?:sumajax|experiments|tests)/[\w/.]+)`", text):
+        assert list(ROOT.glob(file.replace("NAME", "*"))), file
+
+
+def test_pages_and_sections_that_code_cites():
+    """As `docs/reference/learning.md, Gradients`: there is the page, and the section in it."""
+    cited = set()
+    for file in sorted(file for folder in CODE for file in (ROOT / folder).rglob("*.py")):
+        text = re.sub(r"\s+(?:# )?", " ", file.read_text())
+        cited |= {(file, *found) for found in CITATION.findall(text)}
+    assert {place for _, place, _ in cited} >= {"docs/settings.md", "docs/reference/learning.md"}
+    for file, place, section in cited:
+        assert (ROOT / place).exists(), (file, place)
+        names = headings(ROOT / place)
+        assert not section or any(section.startswith(name) for name in names), (file, section)
+
+
+def headings(page: Path) -> list[str]:
+    without_code = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    return re.findall(r"^#+ (.*)$", without_code, re.MULTILINE)
+
+
+def anchor(name: str) -> str:
+    """The anchor of a section, as the site makes it."""
+    return re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", name).strip().lower())
+
+
+def test_figures_are_those_of_the_script(tmp_path):
+    files = runpy.run_path(str(DOCS / "figures.py"))["main"](tmp_path)
+    assert len(files) == 2
+    for drawn in files:
+        assert png_size(drawn) == png_size(DOCS / drawn.name)
+
+
+def png_size(file: Path) -> bytes:
+    """Width and height, as the header has them."""
+    return file.read_bytes()[16:24]
+
+
+@pytest.mark.slow
+def test_the_tutorial_as_a_notebook(tmp_path):
+    """Made and executed by the commands of docs/tutorial.md."""
+    for tool in ("jupytext", "nbconvert", "ipykernel"):
+        pytest.importorskip(tool, reason="needs the extra docs")
+    (tmp_path / "experiments").symlink_to(ROOT / "experiments")
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    commands = re.findall(r"^(?:jupytext|jupyter) .*$", (DOCS / "tutorial.md").read_text(), re.M)
+    assert len(commands) == 2
+    for command in commands:
+        subprocess.run(
+            shlex.split(command), cwd=tmp_path, env=os.environ | {"PATH": path}, check=True
+        )
+    cells = json.loads((tmp_path / "tutorial.ipynb").read_text())["cells"]
+    outputs = [output for cell in cells for output in cell.get("outputs", ())]
+    printed = "".join("".join(output.get("text", ())) for output in outputs)
+    assert "actions of 8 teams of 5: (8, 5)" in printed
+    assert (next((tmp_path / "runs").glob("tutorial-*")) / "replay.gif").exists()

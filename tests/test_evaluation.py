@@ -67,7 +67,7 @@ class TestRandomPolicy:
         ("env", "steps", "success"), [(PP, 68.93, 0.369), (PCP, 70.78, 0.325)], ids=["PP", "PCP"]
     )
     def test_level(self, env, steps, success):
-        """environments.md, reference levels over 6,000 episodes; here four standard errors."""
+        """docs/reference/predator_prey.md, Reference levels: of 6,000; four standard errors."""
         result = evaluate_random(env, make_policy("iric", env), jax.random.key(0))
         assert abs(np.mean(result.steps_taken) - steps) < 4 * 18.4 / np.sqrt(EPISODES)
         assert abs(np.mean(result.success) - success) < 4 * 0.5 / np.sqrt(EPISODES)
@@ -189,7 +189,7 @@ class TestBound:
         ("env", "steps", "deviation"), [(PP, 4.67, 1.33), (PCP, 5.08, 1.36)], ids=["PP", "PCP"]
     )
     def test_mean(self, env, steps, deviation):
-        """environments.md: over 20,000 starts; here over the 1,024 held-out ones."""
+        """docs/reference/predator_prey.md, Reference levels: of 20,000 starts; here of 1,024."""
         bound = np.asarray(shortest_path_steps(env))
         assert abs(bound.mean() - steps) < 4 * deviation / np.sqrt(EPISODES)
         assert abs(bound.std() - deviation) < 0.2

@@ -140,7 +140,7 @@ _PUBLISHED: dict[str, Any] = {
 }
 
 _HETNET: dict[str, Any] = {
-    # Seraj et al. 2022: the program's README command (algorithms.md 4.3, 4.6).
+    # Seraj et al. 2022: the command of its program's README; docs/settings.md.
     **_PUBLISHED,
     "gae_lambda": 0.95,
     "loss": "hetnet",

@@ -1,4 +1,4 @@
-"""HetNet's published loss (Seraj et al. 2022 and its program; algorithms.md 4.3).
+"""HetNet's published loss (Seraj et al. 2022; docs/reference/learning.md, HetNet's loss).
 
 A critic per class instead of per agent, advantages normalised per class, means over episodes where
 the other loss has sums. An environment here is a process of the original: it shares nothing.

@@ -198,8 +198,8 @@ class Learner:
         """One rollout and one optimiser step.
 
         The gradient is that of the loss summed over agents and steps, divided by the number of
-        environment steps (algorithms.md 4.1). An update that is not finite is refused: the state
-        stays as it is, and of the tally only the fault is left.
+        environment steps (docs/reference/learning.md, Gradients). An update that is not finite is
+        refused: the state stays as it is, and of the tally only the fault is left.
         """
         grads, (actors, tally) = self._gradient(state.params, *self._inputs(state), state.updates)
         grads, tally = self._over_devices((grads, tally))
@@ -328,7 +328,7 @@ def until_episode_end(trajectory: Trajectory, least: int) -> chex.Array:
     """(T, E) bool: the steps up to the first episode end at or after step `least`.
 
     The originals' collection rule: episodes are never cut, and a process stops at the first end
-    after its share of steps (algorithms.md 4.1).
+    after its share of steps (docs/reference/learning.md, Two ways to collect).
     """
     step = jnp.arange(trajectory.last.shape[0], dtype=jnp.int32)[:, None]
     enough = (trajectory.last & (step + 1 >= least)).astype(jnp.int32)

@@ -7,7 +7,7 @@ import optax
 from sumajax.learning.config import LearnerConfig
 
 RMSPROP_DECAY, RMSPROP_EPS = 0.97, 1e-6
-"""The originals' settings (algorithms.md 4.2)."""
+"""The originals' settings (docs/reference/learning.md, Optimisers)."""
 
 
 def annealed(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:

@@ -1,4 +1,4 @@
-"""Graph attention: the layer of MAGIC and the relation of HetNet (algorithms.md 2.1, 3.3).
+"""Graph attention: the layer of MAGIC and the relation of HetNet (docs/reference/policies.md).
 
 Both score a pair by the sum of one number of the receiver and one of the sender, K heads side by
 side, and send the sender's projected features along. MAGIC keeps the graph as a factor, so that
@@ -49,7 +49,7 @@ def seen_through(kernel: chex.Array, vectors: chex.Array) -> chex.Array:
 def relation_attention(
     receiver: chex.Array, sender: chex.Array, messages: chex.Array, exclude_self: bool = False
 ) -> tuple[chex.Array, chex.Array]:
-    """What one relation of HetNet's adds to its receivers (algorithms.md 3.3).
+    """What one relation of HetNet's adds to its receivers (docs/reference/policies.md, HetNet).
 
     Args:
       receiver, sender: (..., R, K) and (..., S, K), each agent's share of the scores.
@@ -68,7 +68,9 @@ def relation_attention(
 
 
 class GraphAttention(nn.Module):
-    """MAGIC's attention layer over a drawn graph (algorithms.md 2.1).
+    """MAGIC's attention layer over a drawn graph.
+
+    Source: Niu et al. 2021; docs/reference/policies.md, Attention over a drawn graph.
 
     Attributes:
       heads, features: K and O.

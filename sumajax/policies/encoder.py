@@ -1,8 +1,9 @@
-"""State and view tensors -> features; the same for every policy (algorithms.md 5.2, our decision).
+"""State and view tensors -> features; the same for every policy.
 
-The paper says only "convolutional and fully-connected layers". `flat` reads positions exactly
-because it flattens; `lab_gap` is the encoder of the authors' later public branch, which pools over
-the grid and so cannot tell most inner cells of a native grid apart; `linear` has no convolution.
+The paper says only "convolutional and fully-connected layers" (section IV-C), the sizes are this
+package's: docs/reference/policies.md, Encoders. `flat` reads positions exactly because it flattens;
+`lab_gap` is the encoder of the authors' later public branch, which pools over the grid and so
+cannot tell most inner cells of a native grid apart; `linear` has no convolution.
 """
 
 from typing import Any, Literal, get_args

@@ -110,7 +110,7 @@ def receiver_of(relation: str) -> str:
 
 
 class HetLayer(nn.Module):
-    """One layer of heterogeneous graph attention (algorithms.md 3.3, binary messages 3.4).
+    """One layer of heterogeneous graph attention (docs/reference/policies.md, HetNet).
 
     All parameters exist whatever the team, so that they fit any other team.
 
@@ -296,7 +296,7 @@ class HetLayer(nn.Module):
 
 
 class HetGraph(nn.Module):
-    """Two graph layers and the class critics, from agent features (algorithms.md 3.3, 3.4)."""
+    """Two graph layers and the class critics, from agent features."""
 
     in_features: tuple[int, int]  # of P and A
     heads: int = 4
@@ -360,7 +360,7 @@ class HetGraph(nn.Module):
 
 
 class HetNetCore(nn.Module):
-    """One step from encoded observations: two LSTMs and the graph layers (algorithms.md 5.2)."""
+    """One step from encoded observations: two LSTMs and the graph layers."""
 
     state_features: int = STATE_FEATURES
     view_features: int = VIEW_FEATURES

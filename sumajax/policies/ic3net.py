@@ -32,7 +32,10 @@ class IC3NetCarry:
 
 
 class IC3NetCore(nn.Module):
-    """One step from encoded observations: messages, LSTM, heads (algorithms.md 1.1)."""
+    """One step from encoded observations: messages, LSTM, heads.
+
+    Source: Singh et al. 2019 and its program; docs/reference/policies.md, IC3Net.
+    """
 
     hidden: int
     num_actions: int

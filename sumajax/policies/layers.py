@@ -1,4 +1,6 @@
-"""Layers with the originals' parameters and initialisation (specification, algorithms.md 1.3).
+"""Layers with the originals' parameters and initialisation.
+
+See docs/reference/policies.md, First values.
 
 The published programs are PyTorch: dense, convolution and LSTM tensors start uniform within
 +-1/sqrt(fan_in), and an LSTM has two bias vectors, which matters to RMSprop: their sum moves at

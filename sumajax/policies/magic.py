@@ -91,7 +91,7 @@ class Scheduler(nn.Module):
 class MAGICCore(nn.Module):
     """One step from encoded observations: LSTM, scheduler, two rounds of messages, heads.
 
-    Source: algorithms.md 2.1, sizes 2.2.
+    Source: Niu et al. 2021 and its program; docs/reference/policies.md, MAGIC.
 
     Attributes:
       drawn: whether a scheduler draws who hears whom; without one everybody hears everybody, and

@@ -1,4 +1,4 @@
-"""Settings of the learner: the presets of algorithms.md 4.6, and what is refused."""
+"""Settings of the learner: the presets of docs/settings.md, and what is refused."""
 
 import re
 from dataclasses import asdict
@@ -10,7 +10,7 @@ from sumajax.learning.config import PRESETS
 from sumajax.policies import POLICIES
 
 PUBLISHED = {
-    # algorithms.md 4.1, 4.2, 4.6 and the paper's four processes
+    # docs/settings.md: the programs' arguments, and the paper's four processes (VII-C)
     "num_envs": 4,
     "rollout_length": 500,
     "whole_episodes": True,
@@ -38,7 +38,7 @@ PUBLISHED = {
 }
 
 HETNET = {
-    # algorithms.md 4.3, 4.6
+    # docs/settings.md: the arguments of HetNet's program
     "gae_lambda": 0.95,
     "loss": "hetnet",
     "value_weight": 1.0,

@@ -1,4 +1,7 @@
-"""HetNet's published loss against a slow rendering with explicit padding (algorithms.md 4.3)."""
+"""HetNet's published loss against a slow rendering with explicit padding.
+
+The formulas: docs/reference/learning.md, HetNet's loss.
+"""
 
 from dataclasses import replace
 from functools import partial

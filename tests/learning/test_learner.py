@@ -230,7 +230,7 @@ class TestPresetPaper:
 
 class TestFigures:
     def test_what_is_counted(self):
-        """algorithms.md 4.4: figures of episodes are of those that ended, sampled actions."""
+        """Figures of episodes are of those that ended (docs/reference/learning.md, An epoch)."""
         lengths, rng = [[3, 7], [7, 2]], np.random.default_rng(0)
         trajectory, valid = random_trajectory(rng, lengths)
         parts = LossParts(*map(jnp.float32, (6.0, 8.0, 12.0, 4.0)))

@@ -39,7 +39,7 @@ def assert_same(ours, expected):
 
 
 def rmsprop(grads):
-    """v <- .97 v + .03 g^2 from v = 0; g / (sqrt(v) + 1e-6) (algorithms.md 4.2)."""
+    """v <- .97 v + .03 g^2 from v = 0; g / (sqrt(v) + 1e-6) (the programs' PyTorch)."""
     v, result = jax.tree.map(np.zeros_like, grads[0]), []
     for grad in grads:
         v = jax.tree.map(lambda v, g: 0.97 * v + 0.03 * g**2, v, grad)

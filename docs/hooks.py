@@ -1,0 +1,59 @@
+"""Pages of the site that live elsewhere in the repository, with what they link to.
+
+mkdocs reads one folder; the measured results and the speed tables are kept where they are made.
+Links between them are those of the repository, and are turned into the site's.
+"""
+
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).parents[1]
+PLACES = {ROOT / "docs": "", ROOT / "experiments/results": "results", ROOT / "benchmarks": "speed"}
+"""Folders of the repository that have pages, and where the site has them."""
+LINK = re.compile(r"(?<=\]\()(?!https?:|#)[^)#\s]+")
+
+
+def linked(page: Path) -> set[Path]:
+    """The page and all that it links to, through other pages, within its folder."""
+    found, waiting = {page}, [page]
+    while waiting:
+        text = waiting.pop().read_text()
+        places = [page.parent / link for link in LINK.findall(text)]
+        new = {p for p in places if p.is_file() and ".." not in p.parts} - found
+        found |= new
+        waiting += [p for p in new if p.suffix == ".md"]
+    return found
+
+
+def place_of(path: Path) -> str | None:
+    """Where the site has a file of the repository."""
+    for folder, place in PLACES.items():
+        if path.is_relative_to(folder):
+            return posixpath.join(place, path.relative_to(folder).as_posix())
+    return None
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    for folder, place in PLACES.items():
+        if place:
+            for path in sorted(linked(folder / "README.md")):
+                uri = f"{place}/{path.relative_to(folder).as_posix()}"
+                files.append(File.generated(config, uri, abs_src_path=str(path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    lies_in = Path(page.file.abs_src_path or ROOT).parent
+    uri = posixpath.dirname(page.file.src_uri)
+
+    def of_the_site(match: re.Match[str]) -> str:
+        place = place_of((lies_in / match[0]).resolve())
+        return match[0] if place is None else posixpath.relpath(place, uri or ".")
+
+    return LINK.sub(of_the_site, markdown)
