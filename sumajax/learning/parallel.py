@@ -49,7 +49,7 @@ EXECUTIONS = {"cpu": Execution(together=False)}
 A CPU's core is full with one seed, whose arrays stay in its cache: four seeds of IC3Net side by
 side took 64.8 CPU microseconds per environment step, one after the other 60.5
 (benchmarks/README.md)."""
-ACCELERATOR = Execution(together=True)
+ACCELERATOR = Execution(together=True, unroll=5)
 """One seed's products are far too small to fill an accelerator: a step takes as long as starting
 its operations does, whatever the number of seeds."""
 
