@@ -143,8 +143,8 @@ def transferred_states(
         )
         for field, part in saved.items()
     }
-    carried["params"] = _without(carried["params"], fresh.params, leave_out)
-    return replace(fresh, **carried)
+    params = _without(carried.pop("params"), fresh.params, leave_out)
+    return parallel.init_seeds_from(stage.learner, list(stage.seeds), params, **carried)
 
 
 def _without(params: Any, fresh: Any, modules: tuple[str, ...]) -> Any:

@@ -228,7 +228,7 @@ class TestLoadAgent:
 
     def test_one_that_there_is_not(self, directory):
         """A place in the list is no seed."""
-        with pytest.raises(CheckpointError, match=r"holds seeds \[7, 8\], not 1\."):
+        with pytest.raises(CheckpointError, match=r"has no seed 1; its seeds are 7, 8\."):
             load_agent(directory, seed=1)
 
     def test_a_task_that_offers_none_offers_none_at_another_size(self):

@@ -18,10 +18,11 @@ from typing import Any
 from experiments.paper.arms import SCRATCH, SOURCE, TRANSFER
 from experiments.paper.parts import Part
 from experiments.paper.published import EXPERIMENTS
-from sumajax.description import describe
+from sumajax.description import describe, rebuild_task
 from sumajax.experiment.directory import plain
 from sumajax.experiment.records import StageRecords
 from sumajax.learning import LearnerConfig, preset
+from sumajax.learning.scaling import for_stage
 from sumajax.policies import make_policy
 from sumajax.reporting import metrics as metrics_file
 
@@ -293,8 +294,8 @@ def changed_settings(plan: Mapping[str, Any]) -> list[str]:
 
 
 def _trained_with(learner: LearnerConfig, stage: Mapping[str, Any]) -> dict[str, Any]:
-    transferred = stage["start"] is not None
-    return plain(asdict(learner.for_stage(stage["epochs"], transferred=transferred)))
+    env, transferred = rebuild_task(dict(stage)), stage["start"] is not None
+    return plain(asdict(for_stage(learner, env, stage["epochs"], transferred=transferred)))
 
 
 def machine() -> dict[str, Any]:

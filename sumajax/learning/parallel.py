@@ -51,7 +51,8 @@ side took 64.8 CPU microseconds per environment step, one after the other 60.5
 (benchmarks/README.md)."""
 ACCELERATOR = Execution(together=True, unroll=5)
 """One seed's products are far too small to fill an accelerator: a step takes as long as starting
-its operations does, whatever the number of seeds."""
+its operations does, whatever the number of seeds. Measured on an H100 with 32 seeds of IC3Net: 2.4 M
+steps/s side by side, 0.26 M one after the other, 2.8 M with five steps in a turn."""
 
 
 def execution_on(platform: str) -> Execution:
@@ -225,6 +226,17 @@ def make_mesh(num_seeds: int, num_envs: int, devices: int) -> Mesh:
 def init_seeds(learner: Learner, seeds: list[int]) -> TrainState:
     """A fresh training state per seed, stacked along a leading axis."""
     return jax.jit(jax.vmap(learner.init))(seed_keys(seeds))
+
+
+def init_seeds_from(
+    learner: Learner, seeds: list[int], params: Any, opt_state: Any = None
+) -> TrainState:
+    """The start of training from given parameters, leaves (S, ...), per seed."""
+
+    def of_one(params: Any, opt_state: Any, key: chex.PRNGKey) -> TrainState:
+        return learner.init_from(params, jax.random.split(key)[1], opt_state)
+
+    return jax.jit(jax.vmap(of_one))(params, opt_state, seed_keys(seeds))
 
 
 def seed_keys(seeds: list[int]) -> chex.PRNGKey:

@@ -37,7 +37,8 @@ def test_the_table(tmp_path):
 def test_a_chain_hands_its_parameters_on(tmp_path):
     chain = {"sizes": (2, 4), "predators": (2, 2), "max_steps": (5, 5), "epochs": (1, 1)}
     wide = {"num_envs": 1000, "rollout_length": 20}
-    main(small(tmp_path, "chain", settings={**wide, "learning_rate": 1e-12}, **chain))
+    still = {"learning_rate": 1e-12, "critic_rate": 1e-12}
+    main(small(tmp_path, "chain", settings={**wide, **still}, **chain))
     out = tmp_path / "out"
     first, second = (np.load(out / f"stage{i}.npz") for i in ("1-2x2", "2-4x4"))
     for name in first:  # at such a rate nothing moves
