@@ -14,6 +14,8 @@ from typing import Any, TypeVar, get_type_hints
 import jax
 import tyro
 
+from sumajax.reporting.output import unfailing_output
+
 Options = TypeVar("Options")
 GOES_ON = "stopped; the same command goes on from the last checkpoint."
 CACHE = Path(".cache") / "sumajax" / "compiled"
@@ -28,16 +30,17 @@ def plain_errors(stopped: str = GOES_ON) -> Iterator[None]:
     Args:
       stopped: what Ctrl-C says.
     """
-    try:
-        yield
-    except (ValueError, OSError) as error:
-        if os.environ.get("SUMAJAX_TRACEBACK"):
-            raise
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        print(stopped, file=sys.stderr)
-        raise SystemExit(130) from None
+    with unfailing_output():
+        try:
+            yield
+        except (ValueError, OSError) as error:
+            if os.environ.get("SUMAJAX_TRACEBACK"):
+                raise
+            print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+            raise SystemExit(2) from None
+        except KeyboardInterrupt:
+            print(stopped, file=sys.stderr)
+            raise SystemExit(130) from None
 
 
 def keep_compiled() -> None:

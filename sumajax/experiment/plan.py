@@ -18,6 +18,7 @@ from sumajax.evaluation import EPISODES
 from sumajax.learning import LearnerConfig
 from sumajax.learning.scaling import for_stage
 from sumajax.policies import Policy, make_policy
+from sumajax.transfer import checkpoints_of
 
 MAX_EPOCHS = 100_000
 """Updates are counted in 32 bits, and an epoch has at most 20,000."""
@@ -207,7 +208,7 @@ def described(experiment: Experiment) -> dict[str, Any]:
 def _described(stage: Stage) -> dict[str, Any]:
     start: Any = stage.start
     if isinstance(start, Path):
-        start = {"checkpoint": checkpoint.identity(start)}
+        start = {"checkpoint": _identity(start)}
     return {
         "name": stage.name,
         "task": describe_task(stage.env),
@@ -217,6 +218,14 @@ def _described(stage: Stage) -> dict[str, Any]:
         "carry_optimiser": stage.carry_optimiser,
         "leave_out": list(stage.leave_out),
     }
+
+
+def _identity(start: Path) -> str | None:
+    """None where nothing is there any more: a stage that has begun does not need it."""
+    try:
+        return checkpoint.identity(checkpoints_of(start))
+    except checkpoint.CheckpointError:
+        return None
 
 
 # --- Plans that are asked for often ------------------------------------------------------------

@@ -92,12 +92,15 @@ class Run:
         check_installed(self.where.log)
         self.experiment.check()
         for stage in self.experiment.stages:
-            if isinstance(stage.start, Path):
-                hosts.first_does(partial(self._check_start, stage))
+            hosts.first_does(partial(self._check_start, stage))
             self.mesh(stage)
 
     def _check_start(self, stage: Stage) -> None:
-        saved_parts(self.stage_run(stage), self.start(stage), carry_optimiser=stage.carry_optimiser)
+        """What a stage that has not begun starts from, if that was made elsewhere."""
+        begun = checkpoint.latest(self.checkpoints(stage)) is not None
+        if isinstance(stage.start, Path) and not begun:
+            run, start = self.stage_run(stage), self.start(stage)
+            saved_parts(run, start, carry_optimiser=stage.carry_optimiser)
 
     def mesh(self, stage: Stage) -> Mesh:
         seeds, envs, where = len(self.experiment.seeds), stage.learner.num_envs, self.where
@@ -392,6 +395,8 @@ def _lead(run: Run) -> dict[str, Any]:
         reporting.Progress(epochs) as progress,
         Loggers(run.where.log, directory, described(experiment)) as loggers,
     ):
+        for stage in experiment.stages:
+            checkpoint.check_directory(run.checkpoints(stage))
         recorder = Recorder(run, directory, progress, loggers)
         for name in hosts.first_does(recorder.unfinished):
             recorder.train(experiment.by_name[name])

@@ -51,8 +51,8 @@ side took 64.8 CPU microseconds per environment step, one after the other 60.5
 (benchmarks/README.md)."""
 ACCELERATOR = Execution(together=True, unroll=5)
 """One seed's products are far too small to fill an accelerator: a step takes as long as starting
-its operations does, whatever the number of seeds. Measured on an H100 with 32 seeds of IC3Net: 2.4 M
-steps/s side by side, 0.26 M one after the other, 2.8 M with five steps in a turn."""
+its operations does, whatever the number of seeds. Measured on an H100 with 32 seeds of IC3Net:
+2.4 M steps/s side by side, 0.26 M one after the other, 2.8 M with five steps in a turn."""
 
 
 def execution_on(platform: str) -> Execution:

@@ -181,11 +181,24 @@ def test_a_source_made_elsewhere(finished, tmp_path):
     assert summary["scratch"] is None
 
 
-def test_a_source_alone(tmp_path):
+def test_a_stage_that_has_begun_needs_its_source_no_more(finished, tmp_path):
+    shutil.copytree(finished[0] / "checkpoints" / "source", tmp_path / "source")
+    experiment = replace(TOY, stages=(replace(TOY.stages[1], start=tmp_path / "source"),))
+    with stopped_in("transfer", Stopped):
+        run_experiment(experiment, tmp_path / "target")
+    shutil.rmtree(tmp_path / "source")
+    summary = run_experiment(experiment, tmp_path / "target")
+    assert summary["transfer"]["epochs"] == 2
+
+
+def test_a_source_alone_in_a_directory_of_any_name(tmp_path):
+    directory = tmp_path / "pp[seed0] \\ *ü?"
     experiment = replace(TOY, stages=TOY.stages[:1])
-    summary = run_experiment(experiment, tmp_path / "source")
-    assert {row["arm"] for row in rows(tmp_path / "source")} == {"source"}
+    summary = run_experiment(experiment, directory)
+    assert {row["arm"] for row in rows(directory)} == {"source"}
     assert summary["transfer"] is None
+    assert load_agent(directory, seed=1).env == TOY.stages[0].env
+    assert [path.name for path in tmp_path.iterdir()] == [directory.name], "no stray directory"
 
 
 def test_a_second_run_in_the_same_directory_is_refused(tmp_path):
