@@ -256,7 +256,8 @@ def stagger(
       keys: (E,) of the steps played here.
     """
     features, params = state_features(env, policy, params), policy.prepare(params)
-    waits = jax.vmap(lambda key: jax.random.randint(key, (), 0, env.max_steps + 1))(keys)
+    most = env.max_steps + 1
+    waits = jax.vmap(lambda key: jax.random.randint(key, (), 0, most, jnp.int32))(keys)
 
     def body(actors: Actors, time: chex.Array) -> tuple[Actors, None]:
         step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, time)
@@ -264,7 +265,7 @@ def stagger(
         following, _ = advance(env, policy, params, features, actors, draws)
         return select(time >= waits, following, actors), None
 
-    return jax.lax.scan(body, actors, jnp.arange(env.max_steps))[0]
+    return jax.lax.scan(body, actors, jnp.arange(env.max_steps, dtype=jnp.int32))[0]
 
 
 def recompute_in_windows(
