@@ -21,6 +21,7 @@ def small(tmp_path, job, **changes):
     )
 
 
+@pytest.mark.slow  # a dozen programs are compiled
 def test_the_table(tmp_path):
     main(small(tmp_path, "table"))
     written = json.loads((tmp_path / "out" / "accelerator.json").read_text())
@@ -34,6 +35,7 @@ def test_the_table(tmp_path):
     assert sum(line.startswith("| ic3net |") for line in lines) == 3
 
 
+@pytest.mark.slow  # a dozen programs are compiled
 def test_a_chain_hands_its_parameters_on(tmp_path):
     chain = {"sizes": (2, 4), "predators": (2, 2), "max_steps": (5, 5), "epochs": (1, 1)}
     wide = {"num_envs": 1000, "rollout_length": 20}

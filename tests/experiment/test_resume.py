@@ -30,7 +30,8 @@ CLOCK = ("compile_seconds", "train_seconds", "env_steps_per_second")
 def arguments(settings: dict, directory: Path) -> list[str]:
     """The command line of a tiny transfer in `directory`."""
     given = ["--devices", "1", "--evaluate-every", "1", "--output", str(directory)]
-    given += ["--policy-settings.hidden", "8", "--episodes", "16", "--checkpoint-every", "1"]
+    given += ["--policy-settings.hidden", "8", "--encoder", "linear", "--episodes", "16"]
+    given += ["--checkpoint-every", "1"]
     for task, fields in TASKS.items():
         for name, value in fields.items():
             given += [f"--{task}.{name}", str(value)]

@@ -36,7 +36,7 @@ TOY = Experiment(
         Stage("transfer", LARGE, 2, start="source", learner=LEARNER),
         Stage("scratch", LARGE, 2, learner=LEARNER),
     ),
-    policy_settings={"hidden": 8},
+    policy_settings={"hidden": 8, "encoder": "linear"},
     seeds=(0, 1),
     name="toy",
     evaluate_every=1,
