@@ -21,9 +21,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sumajax import PredatorPrey, StateUpsampled, evaluate, load_agent, make_learner, make_policy
+from sumajax import (
+    PredatorPrey,
+    StateUpsampled,
+    evaluate,
+    load_agent,
+    make_learner,
+    make_policy,
+    preset,
+)
 from sumajax.environments.types import Environment
 from sumajax.evaluation import evaluate_random, shortest_path_steps
+from sumajax.learning.scaling import for_stage
 from sumajax.reporting import learning_curves, record_episode, rows_of, write_gif, write_strip
 from sumajax.transfer import Chunk, StageRun, fresh_states, run_stage, transferred_states
 
@@ -72,8 +81,9 @@ rows: list[dict] = []
 
 
 def stage_of(arm: str, env: Environment) -> StageRun:
-    """IC3Net on `env` with the settings of the preset `fast`."""
-    learner = make_learner(env, make_policy("ic3net", env))
+    """IC3Net on `env` with the settings of the preset `fast`, as an experiment would train it."""
+    settings = for_stage(preset("fast"), env, EPOCHS, transferred=arm == "transfer")
+    learner = make_learner(env, make_policy("ic3net", env), settings)
     return StageRun(arm, learner, EPOCHS, seeds=(0,), directory=OUTPUT / "checkpoints" / arm)
 
 
@@ -151,7 +161,7 @@ print(f"{'shortest':13}{bound.mean():7.1f} steps")
 # Curves of both arms over environment steps, and an episode: who sees what, who talks, who arrives.
 
 # %%
-learning_curves(rows, OUTPUT / "curves.png", x="env_steps")
+learning_curves(rows, OUTPUT / "curves.png", x="env_steps", after={"transfer": ["source"]})
 episode = record_episode(target, agent.policy, agent.params, jax.random.key(3))
 write_gif(episode, OUTPUT / "replay.gif")
 write_strip(episode, OUTPUT / "replay.png")

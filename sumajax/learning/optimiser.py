@@ -14,8 +14,8 @@ def annealed(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
     """What annealing leaves of the learning rate and the entropy weight after so many updates."""
     if not config.anneal_epochs:
         return 1.0
-    done = jnp.asarray(updates, jnp.float32) / (config.anneal_epochs * config.updates_per_epoch)
-    return jnp.maximum(1.0 - (1.0 - config.anneal_to) * done, config.anneal_to)
+    length = config.anneal_epochs * config.updates_per_epoch
+    return optax.linear_schedule(1.0, config.anneal_to, length)(jnp.asarray(updates, jnp.float32))
 
 
 def learning_rate(config: LearnerConfig, updates: chex.Numeric) -> chex.Numeric:
