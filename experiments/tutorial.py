@@ -103,9 +103,9 @@ def follow(stage: StageRun) -> Callable[[Chunk], None]:
 source_stage = stage_of("source", source)
 run_stage(source_stage, lambda: fresh_states(source_stage), on_chunk=follow(source_stage))
 
-# source   epoch  5:  24.8 steps, success 0.94, 4 s
-# source   epoch 10:   6.7 steps, success 1.00, 5 s
-# source   epoch 15:   6.2 steps, success 1.00, 5 s
+# source   epoch  5:  33.6 steps, success 0.85, 3 s
+# source   epoch 10:   7.6 steps, success 1.00, 3 s
+# source   epoch 15:   6.4 steps, success 1.00, 3 s
 
 # %% [markdown]
 # ## 4. Carry it over, and train from scratch beside it
@@ -120,12 +120,12 @@ untrained = jax.tree.map(lambda leaf: leaf[0], start.params)  # seed 0, before a
 run_stage(transfer_stage, lambda: start, on_chunk=follow(transfer_stage))
 run_stage(scratch_stage, lambda: fresh_states(scratch_stage), on_chunk=follow(scratch_stage))
 
-# transfer epoch  5: 128.8 steps, success 0.58, 7 s     (worse than untrained, at first)
-# transfer epoch 10:  27.8 steps, success 0.99, 7 s
-# transfer epoch 15:  18.4 steps, success 1.00, 7 s
-# scratch  epoch  5: 198.1 steps, success 0.04, 7 s
-# scratch  epoch 10: 175.5 steps, success 0.30, 7 s
-# scratch  epoch 15: 157.0 steps, success 0.47, 7 s
+# transfer epoch  5:  89.0 steps, success 0.74, 5 s     (the critic alone learns at first)
+# transfer epoch 10:  31.3 steps, success 0.99, 5 s
+# transfer epoch 15:  20.7 steps, success 1.00, 5 s
+# scratch  epoch  5: 194.1 steps, success 0.08, 5 s
+# scratch  epoch 10: 192.0 steps, success 0.12, 5 s
+# scratch  epoch 15: 173.3 steps, success 0.30, 5 s
 
 # %% [markdown]
 # ## 5. Judge it on held-out starts
@@ -149,9 +149,9 @@ bound = shortest_path_steps(target)
 assert bound is not None  # a task need not offer one; these do
 print(f"{'shortest':13}{bound.mean():7.1f} steps")
 
-# zero shot      100.6 steps, success 0.612
-# transferred     18.5 steps, success 1.000
-# from scratch   146.9 steps, success 0.421
+# zero shot       85.0 steps, success 0.713
+# transferred     21.4 steps, success 1.000
+# from scratch   167.5 steps, success 0.432
 # random         198.9 steps, success 0.021
 # shortest        10.5 steps
 
@@ -167,7 +167,7 @@ write_gif(episode, OUTPUT / "replay.gif")
 write_strip(episode, OUTPUT / "replay.png")
 print(f"an episode of {episode.num_steps} steps is in {OUTPUT / 'replay.gif'}")
 
-# an episode of 27 steps is in runs/tutorial-20261122-120103/replay.gif
+# an episode of 21 steps is in runs/tutorial-20261126-130638/replay.gif
 
 # %% [markdown]
 # ## 7. Let it act in a program of your own
