@@ -25,6 +25,7 @@ the disk itself (fsync). tests/checkpoint/test_orbax_checkpointer.py shows the f
 which checkpoints there are, `writing` and `reading` do it, `orbax` is all that knows Orbax.
 """
 
+from sumajax.checkpoint.directory import remove_unfinished
 from sumajax.checkpoint.format import DESCRIPTION, MAX_DESCRIPTION_BYTES, MAX_STATE_BYTES
 from sumajax.checkpoint.reading import identity, latest, load, load_params, read_meta
 from sumajax.checkpoint.writing import check_directory, save
@@ -44,5 +45,6 @@ __all__ = [
     "load_params",
     "read_meta",
     "rebuild",
+    "remove_unfinished",
     "save",
 ]

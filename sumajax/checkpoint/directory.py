@@ -45,8 +45,8 @@ def claim(root: Path) -> Path:
 
 
 def remove_unfinished(root: Path) -> None:
-    """What killed saves left behind."""
-    for entry in os.listdir(root):
+    """Removes what killed saves and checks left in `root`, for callers that alone write there."""
+    for entry in os.listdir(root) if root.is_dir() else ():
         if entry.startswith(SCRATCH) and NAME.fullmatch(entry.removeprefix(SCRATCH)):
             remove(root / entry)
 

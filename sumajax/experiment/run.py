@@ -396,6 +396,8 @@ def _lead(run: Run) -> dict[str, Any]:
         Loggers(run.where.log, directory, described(experiment)) as loggers,
     ):
         for stage in experiment.stages:
+            # A finished stage saves no more, which would remove what a killed check left there.
+            checkpoint.remove_unfinished(run.checkpoints(stage))
             checkpoint.check_directory(run.checkpoints(stage))
         recorder = Recorder(run, directory, progress, loggers)
         for name in hosts.first_does(recorder.unfinished):
