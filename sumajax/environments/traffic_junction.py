@@ -14,6 +14,7 @@ of `TrafficJunction` only call them.
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar, Literal, get_args
 
 import chex
@@ -47,6 +48,9 @@ alone."""
 
 MAX_STEPS = 2**31 - 1
 """Steps are counted in int32."""
+
+MAX_RATE_EPOCHS = 1_000_000
+"""Rates are listed epoch by epoch, up to the last in which they change."""
 
 Vocabulary = Literal["bool", "scalar"]
 """How the originals' flat observation names a cell: by one entry of many, or by its two numbers."""
@@ -90,7 +94,8 @@ class TrafficJunction:
       vision: how many cells a car sees in each direction.
       max_steps: step limit, with which every episode ends: 20, 40, 80.
       arrival_rate: chance that a car enters, per entry and step: 0.3, 0.2, 0.05.
-      final_arrival_rate: what the rate rises to in the course of training; None: it stays.
+      final_arrival_rate: what the rate rises to in the course of training, and what the task is
+        once that is over: an episode that is not of some epoch has it. None: it stays.
       rate_epochs: the first epoch in which it rises, and the first in which it no longer does.
       reset_last_action: a new car has not braked. In the original it has if the last car that
         stayed in its slot did.
@@ -159,8 +164,22 @@ class TrafficJunction:
     def sighted_classes(self) -> tuple[bool, ...]:
         return (True,)
 
+    @property
+    def rises(self) -> bool:
+        """Whether the rate changes while training goes on; in epoch 0 it never does."""
+        last, (first_epoch, end) = self.final_arrival_rate, self.rate_epochs
+        return last is not None and last > self.arrival_rate and end > max(first_epoch, 1)
+
+    @property
+    def last_arrival_rate(self) -> float:
+        """The rate of the task that training leads to."""
+        return self.final_arrival_rate if self.rises else self.arrival_rate  # type: ignore[return-value]
+
     def reset(self, key: chex.PRNGKey) -> State:
         return reset(self, key)
+
+    def reset_in_epoch(self, key: chex.PRNGKey, epoch: chex.Numeric) -> State:
+        return reset_in_epoch(self, key, epoch)
 
     def step(self, state: State, actions: chex.Array) -> tuple[State, Transition]:
         return step(self, state, actions)
@@ -215,9 +234,9 @@ def reset(
 
     Args:
       key: from which the arrivals of this episode are drawn.
-      arrival_rate: another rate than the configuration's; may be traced.
+      arrival_rate: another rate than `env.last_arrival_rate`; may be traced.
     """
-    rate = env.arrival_rate if arrival_rate is None else arrival_rate
+    rate = env.last_arrival_rate if arrival_rate is None else arrival_rate
     return State(
         place=jnp.full(env.num_cars, env.roads.nowhere, jnp.int32),
         alive=jnp.zeros(env.num_cars, bool),
@@ -228,6 +247,26 @@ def reset(
         arrival_rate=jnp.asarray(rate, jnp.float32),
         key=key,
     )
+
+
+def reset_in_epoch(env: TrafficJunction, key: chex.PRNGKey, epoch: chex.Numeric) -> State:
+    """`reset` as it is while training goes on, at the rate of an epoch.
+
+    Args:
+      epoch: () int32, counted from 0; may be traced.
+
+    Source: the curriculum of IC3Net's published program.
+    """
+    if not env.rises:
+        return reset(env, key)
+    table = rate_table(env)
+    return reset(env, key, jnp.asarray(table)[jnp.clip(epoch, 0, len(table) - 1)])
+
+
+@cache
+def rate_table(env: TrafficJunction) -> np.ndarray:
+    """(epochs,) float32: `rates` up to the first epoch after the last rise."""
+    return rates(env, np.arange(env.rate_epochs[1] + 1)).astype(np.float32)
 
 
 def step(env: TrafficJunction, state: State, actions: chex.Array) -> tuple[State, Transition]:
@@ -480,3 +519,5 @@ def _validate(env: TrafficJunction) -> None:
     pair = isinstance(epochs, tuple) and len(epochs) == 2
     if not pair or not all(isinstance(epoch, int) for epoch in epochs):
         raise ValueError(f"rate_epochs are two whole numbers, first and end, got {epochs!r}.")
+    if epochs[1] > MAX_RATE_EPOCHS:
+        raise ValueError(f"rate_epochs must end by {MAX_RATE_EPOCHS}, got {epochs!r}.")

@@ -1,5 +1,7 @@
 """What every domain offers: the `Environment` contract and the two records that cross it."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import chex
@@ -48,7 +50,9 @@ class Environment(Protocol):
 
     Optional functions, used where a domain has them: `shortest_steps(state)`, () int32, the fewest
     steps that the team could still need; `sparse_states()`, the `states.SparseStates` that
-    `state_table` lists, for large grids, whose table grows with the square of the cells.
+    `state_table` lists, for large grids, whose table grows with the square of the cells;
+    `reset_in_epoch(key, epoch)`, a fresh episode of an epoch of training, of a task that becomes
+    harder while it is learnt (see `resets`).
     """
 
     @property
@@ -116,6 +120,18 @@ class Environment(Protocol):
         Such a task also fills in `Observation.alive` and `Transition.left`; an agent that is alive
         after a step in which its place was left is another one.
         """
+
+
+def resets(env: Environment, epoch: chex.Numeric) -> Callable[[chex.PRNGKey], Any]:
+    """How episodes begin in epoch `epoch` of training, () int32 from 0 and perhaps traced.
+
+    By `env.reset_in_epoch` where the task has it, and as everywhere else, by `env.reset`, where it
+    does not change. What changes has to be in the state: an episode that is under way when an epoch
+    ends stays as it began, and the next one is of the new epoch. `reset` is the task that training
+    leads to, which evaluation plays.
+    """
+    changing = getattr(env, "reset_in_epoch", None)
+    return env.reset if changing is None else partial(changing, epoch=epoch)
 
 
 def agents_leave(env: Environment) -> bool:

@@ -231,13 +231,13 @@ class Learner:
         """Where an update's rollout starts, and all its random numbers."""
         config = self.config
         keys = self._keys(state.key, state.updates)
+        epoch = state.updates // config.updates_per_epoch
         actors, length = state.actors, config.rollout_length
         if config.whole_episodes:
-            actors = start(
-                self.env, self.policy, jax.vmap(partial(jax.random.fold_in, data=0))(keys)
-            )
+            starts = jax.vmap(partial(jax.random.fold_in, data=0))(keys)
+            actors = start(self.env, self.policy, starts, epoch)
             length += self.env.max_steps - 1
-        return actors, draw(self.env, self.policy, keys, length)
+        return actors, draw(self.env, self.policy, keys, length, epoch)
 
     def _gradient(
         self, params: Any, actors: Actors, draws: Draws, updates: chex.Array

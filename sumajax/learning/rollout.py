@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from sumajax.environments.states import listed_states
-from sumajax.environments.types import Environment, Transition, agents_leave
+from sumajax.environments.types import Environment, Transition, agents_leave, resets
 from sumajax.learning.windows import windows
 from sumajax.policies.types import Decision, Policy
 from sumajax.records import exportable
@@ -71,24 +71,33 @@ class Trajectory:
         return self.terminated | self.truncated
 
 
-def start(env: Environment, policy: Policy, keys: chex.PRNGKey) -> Actors:
-    """Fresh episodes, one per key of `keys` (E,)."""
+def start(
+    env: Environment, policy: Policy, keys: chex.PRNGKey, epoch: chex.Numeric = 0
+) -> Actors:
+    """Fresh episodes of an epoch of training, one per key of `keys` (E,)."""
     num_envs = keys.shape[0]
     return Actors(
-        env_state=jax.vmap(env.reset)(keys),
+        env_state=jax.vmap(resets(env, epoch))(keys),
         carry=policy.initial_carry((num_envs,)),
         episode_return=jnp.zeros((num_envs, env.num_agents), jnp.float32),
     )
 
 
-def draw(env: Environment, policy: Policy, keys: chex.PRNGKey, length: int) -> Draws:
-    """The random numbers of `length` steps; each environment's come from its own key (E,)."""
+def draw(
+    env: Environment, policy: Policy, keys: chex.PRNGKey, length: int, epoch: chex.Numeric = 0
+) -> Draws:
+    """The random numbers of `length` steps; each environment's come from its own key (E,).
+
+    Args:
+      epoch: () int32 of training, from 0: the episodes that begin in these steps are of it.
+    """
+    fresh = resets(env, epoch)
 
     def of_one(key: chex.PRNGKey) -> Draws:
         noise_key, reset_key = jax.random.split(key)
         return Draws(
             noise=policy.sample_noise(noise_key, (length,)),
-            fresh=jax.vmap(env.reset)(jax.random.split(reset_key, length)),
+            fresh=jax.vmap(fresh)(jax.random.split(reset_key, length)),
         )
 
     return jax.vmap(of_one, out_axes=1)(keys)
