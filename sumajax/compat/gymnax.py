@@ -130,7 +130,8 @@ class AutoReset:
             for name, shape in shapes.items()
         }
         if agents_leave(self.env):
-            boxes["alive"] = spaces.Box(0, 1, (self.env.num_agents,), jnp.bool_)
+            flags = spaces.Box(0, 1, (self.env.num_agents,), jnp.bool_)
+            boxes |= {"alive": flags, "entered": flags}
         return spaces.Dict(boxes)
 
     def action_space(self, params: EnvParams | None = None) -> Any:

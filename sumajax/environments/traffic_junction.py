@@ -337,7 +337,8 @@ def observe(env: TrafficJunction, state: State) -> Observation:
     slots, channels = np.arange(env.num_cars)[:, None, None], np.arange(2)[:, None]
     tensor = jnp.zeros((env.num_cars, *env.state_shape))
     tensor = tensor.at[slots, channels, row, column].set(1, mode="drop")
-    return Observation(state=tensor, view=view(env, state), alive=state.alive)
+    entered = state.alive & (state.wait == 0)
+    return Observation(state=tensor, view=view(env, state), alive=state.alive, entered=entered)
 
 
 def view(env: TrafficJunction, state: State) -> chex.Array:

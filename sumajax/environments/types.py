@@ -23,6 +23,7 @@ class Observation:
     state: chex.Array  # (N, C, rows, columns) float32: the agent's own cell, one-hot (or upsampled)
     view: chex.Array  # (N, c, m, m) float32: entity counts around the agent, -1 outside the grid
     alive: chex.Array | None = None  # (N,) bool, needed where agents leave; None: all are there
+    entered: chex.Array | None = None  # (N,) bool: has come with the last step; None: not told
 
 
 @exportable
@@ -118,7 +119,9 @@ class Environment(Protocol):
 
         Read only where the task says that agents come and go, by a constant `agents_leave = True`.
         Such a task also fills in `Observation.alive` and `Transition.left`; an agent that is alive
-        after a step in which its place was left is another one.
+        after a step in which its place was left is another one. `Observation.entered`, who has come
+        with the last step, into an empty place or one that was left, is for those who act on
+        observations alone with a policy whose newcomers have no memory (`fresh_memory`).
         """
 
 

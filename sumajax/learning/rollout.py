@@ -163,9 +163,7 @@ def presence_in(
 
 def hand_on(policy: Policy, carry: Any, presence: Presence | None) -> Any:
     """What the agents remember after a step; nothing, for who is new, if the policy says so."""
-    if presence is None or not policy.fresh_memory:
-        return carry
-    return select(presence.entered, policy.initial_carry(presence.entered.shape[:1]), carry)
+    return carry if presence is None else policy.handed_on(carry, presence.entered)
 
 
 def rollout(

@@ -206,6 +206,7 @@ class Policy:
             state=jnp.zeros((team.num_agents, *team.state_shape), jnp.float32),
             view=jnp.zeros((team.num_agents, *team.view_shape), jnp.float32),
             alive=jnp.ones(team.num_agents, bool) if team.agents_leave else None,
+            entered=jnp.zeros(team.num_agents, bool) if team.agents_leave else None,
         )
         return self.module.init(
             key,
@@ -229,11 +230,40 @@ class Policy:
     def apply_with(
         self, params: Any, carry: Any, obs: Observation, noise: Any
     ) -> tuple[Any, PolicyOutput]:
-        """`apply` with given random numbers; all zeros make every choice the likeliest."""
+        """`apply` with given random numbers; all zeros make every choice the likeliest.
+
+        Raises:
+          ValueError: where newcomers have no memory, and nothing says who has come.
+        """
         chex.assert_shape(obs.state, (..., *self.team.state_shape))
         chex.assert_shape(obs.view, (..., *self.team.view_shape))
+        if self.team.agents_leave and self.fresh_memory:
+            carry = self.handed_on(carry, obs.entered)
         step = self.module.apply(params, carry, obs, noise, method=self.module.encode_and_step)
         return cast(tuple[Any, PolicyOutput], step)
+
+    def handed_on(self, carry: Any, entered: chex.Array | None) -> Any:
+        """What the agents go into a step with, of what was remembered in their places before.
+
+        Args:
+          entered: (..., N) bool: has come with the step before.
+
+        Raises:
+          ValueError: where newcomers have no memory, and nothing says who has come.
+        """
+        if not self.fresh_memory:
+            return carry
+        if entered is None:
+            raise ValueError(
+                f"policy {self.name!r} starts newcomers without memory, but nothing says who has "
+                "come with the last step: set `entered` of the observation, (..., N) bool."
+            )
+
+        def leaf(fresh: chex.Array, kept: chex.Array) -> chex.Array:
+            new = jnp.reshape(entered, (*entered.shape, *(1,) * (kept.ndim - entered.ndim)))
+            return jnp.where(new, fresh, kept)
+
+        return jax.tree.map(leaf, self.initial_carry(entered.shape[:-1]), carry)
 
     def only_critic(self, params: Any) -> Any:
         """bool for each leaf of `params`: whether nothing but the value depends on it."""

@@ -5,6 +5,7 @@ Policies with dead agents (`policy_*` files of the same folder) are compared els
 
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import traffic_data as data
@@ -137,4 +138,7 @@ def test_curriculum(name: str):
     env = TrafficJunction(
         arrival_rate=first, final_arrival_rate=last, rate_epochs=(int(start), int(end))
     )
-    np.testing.assert_array_equal(env.rates(np.arange(len(recorded))), recorded)
+    epochs = np.arange(len(recorded))
+    np.testing.assert_array_equal(env.rates(epochs), recorded)
+    begin = jax.jit(jax.vmap(lambda epoch: env.reset_in_epoch(jax.random.key(0), epoch)))
+    np.testing.assert_array_equal(begin(epochs).arrival_rate, recorded.astype(np.float32))

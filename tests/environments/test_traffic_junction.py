@@ -92,6 +92,7 @@ class TestConfiguration:
             ({"max_steps": 0}, "max_steps must be at least 1"),
             ({"arrival_rate": 1.5}, "arrival_rate is a chance between 0 and 1, got 1.5"),
             ({"final_arrival_rate": "x"}, "final_arrival_rate is a chance between 0 and 1"),
+            ({"rate_epochs": (0, 2_000_000)}, "rate_epochs must end by 1000000, got"),
             ({"rate_epochs": (1,)}, "rate_epochs are two whole numbers"),
         ],
     )
@@ -310,6 +311,26 @@ class TestSight:
             flat_observation(env, states[-1], "words")
 
 
+def test_who_has_come_is_part_of_what_is_seen():
+    """The same as of the step: into an empty slot, or one that was left in it."""
+    states, transitions = play(
+        EASY,
+        [
+            (GO, [(0, 0, 0)]),
+            (GO, [(1, 2, 0)]),
+            *[(GO, [])] * 5,
+            (GO, [(0, 0, 0)]),  # in which slot 0 is left
+            (GO, []),
+        ],
+    )
+    assert [transition.left.tolist() for transition in transitions[6:8]] == [
+        [False] * 3,
+        [True, False, False],
+    ]
+    seen = [np.flatnonzero(observe(EASY, state).entered).tolist() for state in states]
+    assert seen == [[], [0], [2], [], [], [], [], [], [0], []]
+
+
 class TestCurriculum:
     def test_a_rate_stays_unless_it_is_to_rise(self):
         for last in (None, 0.1, 0.05):
@@ -326,6 +347,22 @@ class TestCurriculum:
     def test_an_epoch_counts_once(self):
         env = TrafficJunction(arrival_rate=0.1, final_arrival_rate=0.2, rate_epochs=(2, 6))
         np.testing.assert_allclose(env.rates([2, 2, 3, 1]), [0.12, 0.12, 0.14, 0.14])
+
+
+    def test_an_episode_is_at_the_last_rate_or_at_that_of_its_epoch(self):
+        env = TrafficJunction(arrival_rate=0.1, final_arrival_rate=0.2, rate_epochs=(2, 6))
+        assert env.last_arrival_rate == 0.2
+        assert float(env.reset(KEY).arrival_rate) == np.float32(0.2)
+        rates = jax.vmap(lambda epoch: env.reset_in_epoch(KEY, epoch).arrival_rate)(jnp.arange(9))
+        np.testing.assert_array_equal(rates, env.rates(np.arange(9)).astype(np.float32))
+
+    def test_a_rate_that_does_not_rise_is_that_of_every_episode(self):
+        constant = {"final_arrival_rate": 0.05, "rate_epochs": (0, 4)}
+        for settings in ({}, constant, {"final_arrival_rate": 0.3, "rate_epochs": (0, 1)}):
+            env = TrafficJunction(arrival_rate=0.1, **settings)
+            assert not env.rises
+            for state in (env.reset(KEY), env.reset_in_epoch(KEY, 7)):
+                assert float(state.arrival_rate) == np.float32(0.1)
 
 
 class TestPrograms:

@@ -18,11 +18,12 @@ from test_probes import values_by_step
 from trajectories import Sum
 
 from sumajax.environments.types import Observation, Transition
-from sumajax.evaluation import evaluate
+from sumajax.evaluation import Agent, evaluate
 from sumajax.learning import LearnerConfig, losses, make_learner, preset
 from sumajax.learning.learner import tally_of
 from sumajax.learning.rollout import draw, rollout, start
 from sumajax.policies import Policy, PolicyOutput, TeamSpec, make_policy
+from sumajax.reporting.replay.recording import record
 
 THERE = np.array([[0, 1], [1, 1], [1, 1], [1, 0], [1, 1], [1, 1]], bool)
 """Before each of five steps and after the last. Place 1 is left in step 2 and taken again in step
@@ -74,7 +75,10 @@ class Rota:
 
     def observe(self, state: RotaState) -> Observation:
         states = self.state_table()[self.state_index(state)]
-        return Observation(states, self.view(state), self.alive(state))
+        before = jnp.maximum(state.time - 1, 0)
+        kept = jnp.asarray(THERE)[before] & ~jnp.asarray(LEFT)[before]
+        entered = self.alive(state) & ~kept & (state.time > 0)
+        return Observation(states, self.view(state), self.alive(state), entered)
 
     def view(self, state: RotaState) -> chex.Array:
         return jnp.zeros((2, 1, 1, 1))
@@ -138,6 +142,31 @@ MEMORY = {
 def test_memory_goes_with_the_place_or_with_the_agent(fresh, gap):
     trajectory = played(fresh, gap, episodes=2)
     np.testing.assert_array_equal(trajectory.value[:, 0], np.tile(MEMORY[fresh], (2, 1)))
+
+
+@pytest.mark.parametrize("fresh", MEMORY)
+def test_memory_of_who_acts_on_observations_alone(fresh):
+    """What is seen says who has come, so no transition is needed: an agent's `act`, a replay."""
+    env = Rota()
+    policy = Policy("sum", SumHere(TeamSpec.of(env), states=STEPS + 1, fresh_memory=fresh))
+    params = {"params": {"x": jnp.ones(STEPS + 1)}}
+    agent, state = Agent(env, policy, params), env.reset(jax.random.key(0))
+    carry, remembered = agent.initial_carry(), []
+    for _ in range(STEPS):
+        carry, action = agent.act(carry, env.observe(state), jax.random.key(0))
+        state, _ = env.step(state, action)
+        remembered.append(carry)
+    np.testing.assert_array_equal(remembered, MEMORY[fresh])
+    recorded = record(env, policy, params, jax.random.key(0))
+    np.testing.assert_array_equal(recorded.actions, np.array(MEMORY[fresh]) > 2)
+
+
+def test_memory_needs_to_know_who_has_come():
+    policy = Policy("sum", SumHere(TeamSpec.of(Rota()), states=STEPS + 1, fresh_memory=True))
+    seen = replace(Rota().observe(RotaState(jnp.int32(1))), entered=None)
+    params = {"params": {"x": jnp.ones(STEPS + 1)}}
+    with pytest.raises(ValueError, match="nothing says who has come with the last step: set `ent"):
+        policy.apply(params, policy.initial_carry(), seen, jax.random.key(0))
 
 
 @pytest.mark.parametrize("gap", [None, 2, 100])
