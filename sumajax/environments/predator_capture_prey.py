@@ -35,6 +35,12 @@ NEAR_CAPTURE_REWARD = -0.025
 MAX_STEPS = 2**31 - 1
 """Steps are counted in int32."""
 
+NEARNESS = (0.9, 0.97, 0.99)
+"""Bases of `critic_features`: a power of the way that is left tells apart ways of up to some 10, 30
+and 100 steps."""
+OFFSET_UNIT = 10.0
+"""Cells, of the offsets in `critic_features`: the side of a middling grid."""
+
 PREDATOR, CAPTURER = 0, 1
 
 RewardMode = Literal["mixed", "cooperative", "competitive"]
@@ -156,6 +162,9 @@ class PredatorCapturePrey:
     def shortest_steps(self, state: State) -> chex.Array:
         return shortest_steps(self, state)
 
+    def critic_features(self, state: State) -> chex.Array:
+        return critic_features(self, state)
+
 
 def reset(env: PredatorCapturePrey, key: chex.PRNGKey) -> State:
     """A fresh episode: agents and prey on distinct cells, every placement equally likely."""
@@ -273,6 +282,33 @@ def shortest_steps(env: PredatorCapturePrey, state: State) -> chex.Array:
     """
     distance = jnp.abs(state.agents - state.prey[None]).sum(-1, dtype=jnp.int32)
     return (distance + (~state.captured).astype(jnp.int32)).max()
+
+
+def critic_features(env: PredatorCapturePrey, state: State) -> chex.Array:
+    """(N, 15) float32: what each agent's future depends on, prey and team-mates included.
+
+    Of itself: offset to the prey (rows, columns, in units of `OFFSET_UNIT`), nearness to it at each
+    scale of `NEARNESS`, whether it has reached and captured it, whether it sees it, whether it can
+    capture. Of the team: mean and greatest nearness at each scale but the last, share of agents
+    that are done, whether anybody sees the prey.
+    """
+    offset = (state.prey[None] - state.agents).astype(jnp.float32)
+    way = jnp.abs(offset).sum(-1, keepdims=True)
+    nearness = jnp.concatenate([base**way for base in NEARNESS], axis=-1)
+    done = state.reached & state.captured
+    sight = jnp.asarray([env.vision, -1 if env.capture_vision is None else env.capture_vision])
+    sees = jnp.abs(offset).max(-1) <= sight[env.agent_class].astype(jnp.float32)
+    flags = jnp.stack([state.reached, state.captured, sees, env.agent_class == CAPTURER], -1)
+    of_team = jnp.concatenate(
+        [
+            nearness[:, :-1].mean(0),
+            nearness[:, :-1].max(0),
+            jnp.stack([done.astype(jnp.float32).mean(), sees.any().astype(jnp.float32)]),
+        ]
+    )
+    of_team = jnp.broadcast_to(of_team[None], (env.num_agents, of_team.shape[0]))
+    own = [offset / OFFSET_UNIT, nearness, flags.astype(jnp.float32)]
+    return jnp.concatenate([*own, of_team], axis=-1).astype(jnp.float32)
 
 
 def _start(env: PredatorCapturePrey, agents: chex.Array, prey: chex.Array) -> State:

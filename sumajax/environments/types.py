@@ -52,6 +52,9 @@ class Environment(Protocol):
     Optional functions, used where a domain has them: `shortest_steps(state)`, () int32, the fewest
     steps that the team could still need; `sparse_states()`, the `states.SparseStates` that
     `state_table` lists, for large grids, whose table grows with the square of the cells;
+    `critic_features(state)`, (N, F) float32, what a critic of its own is shown in training: what
+    tells how each agent will fare, seen by anybody or not, in numbers that mean the same on any
+    grid and in any team;
     `reset_in_epoch(key, epoch)`, a fresh episode of an epoch of training, of a task that becomes
     harder while it is learnt (see `resets`).
     """

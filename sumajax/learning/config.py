@@ -16,6 +16,7 @@ Loss = Literal["actor_critic", "hetnet"]
 Preset = Literal["fast", "paper"]
 Advantages = Literal["raw", "centred", "normalised"]
 AliveMask = Literal["before", "after"]
+Critic = Literal["policy", "state"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class LearnerConfig:
         that before a newcomer's first is, and the newcomer's reward is paid to who has left.
       loss: `actor_critic`, or `hetnet`, the per-class loss of HetNet's published program, which
         is of whole episodes only and normalises advantages in its own way.
+      critic: `policy`: the policy's own, from what the agents know; or `state`: one that is shown
+        the true state in training, and shares nothing with the policy (`learning.critic`).
       value_weight, policy_weight, entropy_weight: of the critic's squared error, of the policy
         gradient and of the entropy bonus.
       optimiser, learning_rate: Adam, or RMSprop as the originals set it.
@@ -52,7 +55,7 @@ class LearnerConfig:
       critic_epochs: so long at the start the critic alone learns, at `critic_rate`: only parameters
         that no decision depends on change, so a policy brought from elsewhere stays as it is until
         its critic knows the task.
-      critic_rate: the learning rate of that time.
+      critic_rate: the learning rate of that time, and always of critic `state`.
       warmup_epochs: the learning rate rises linearly from 0 over this many epochs.
       anneal_epochs: learning rate and entropy weight fall linearly to `anneal_to` of their start
         over this many epochs; 0 keeps them constant; None: over the whole stage, whose length
@@ -75,6 +78,7 @@ class LearnerConfig:
     mask_inactive: bool = True
     alive_mask: AliveMask = "before"
     loss: Loss = "actor_critic"
+    critic: Critic = "policy"
     value_weight: float = 0.5
     policy_weight: float = 1.0
     entropy_weight: float = 0.004
@@ -252,6 +256,7 @@ def _validate(config: LearnerConfig) -> None:
     for name, choices in (
         ("optimiser", Optimiser),
         ("loss", Loss),
+        ("critic", Critic),
         ("advantages", Advantages),
         ("alive_mask", AliveMask),
     ):
@@ -278,6 +283,7 @@ def _validate_hetnet(config: LearnerConfig) -> None:
         "bootstrap_timeouts": False,
         "mask_inactive": False,
         "team_reward": 0.0,
+        "critic": "policy",
     }
     for name, value in needed.items():
         if getattr(config, name) != value:

@@ -13,8 +13,9 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from sumajax.environments.types import Environment
-from sumajax.learning import guard
+from sumajax.learning import critic, guard
 from sumajax.learning.config import LearnerConfig
+from sumajax.learning.critic import CriticState
 from sumajax.learning.hetnet_loss import hetnet
 from sumajax.learning.losses import LossFunction, LossParts, actor_critic
 from sumajax.learning.optimiser import annealed, learning_rate, make_optimiser
@@ -38,6 +39,10 @@ START = -1
 """Update number folded into the keys of the first episodes, before update 0."""
 
 
+CRITIC = 2**32 - 1
+"""Folded into the key of a critic's first parameters; no update has this number."""
+
+
 @struct.dataclass
 class TrainState:
     """Everything training needs to go on; saved and restored as it is."""
@@ -47,6 +52,7 @@ class TrainState:
     actors: Actors  # leaves (E, ...)
     key: chex.PRNGKey  # (): never changes; each update folds its number in
     updates: chex.Array  # () int32 updates done
+    critic: CriticState | None = None  # where it is not a part of the policy
 
 
 @struct.dataclass
@@ -174,12 +180,15 @@ class Learner:
         if not self.config.whole_episodes:
             ahead = jax.vmap(partial(jax.random.fold_in, data=0))(keys)
             actors = stagger(self.env, self.policy, params, actors, ahead)
+        own_critic = self.config.critic == "state"
+        critic_key = jax.random.fold_in(key, CRITIC)
         return TrainState(
             params=params,
             opt_state=fresh if opt_state is None else opt_state,
             actors=actors,
             key=key,
             updates=jnp.int32(0),
+            critic=critic.init_critic(self.env, critic_key) if own_critic else None,
         )
 
     @partial(jax.jit, static_argnums=(0, 2))
@@ -201,31 +210,40 @@ class Learner:
         environment steps (docs/reference/learning.md, Gradients). An update that is not finite is
         refused: the state stays as it is, and of the tally only the fault is left.
         """
-        grads, (actors, tally) = self._gradient(state.params, *self._inputs(state), state.updates)
+        weights = self._weights(state)
+        grads, (actors, tally) = self._gradient(weights, *self._inputs(state), state.updates)
         grads, tally = self._over_devices((grads, tally))
         grads = jax.tree.map(lambda g: g / tally.env_steps.astype(g.dtype), grads)
-        tally = replace(tally, gradient_norm=optax.tree.norm(grads), updates=jnp.int32(1))
-        optimiser = make_optimiser(self.config)
-        grads, opt_state = self._critic_alone(grads, state)
-        # Its own arithmetic mixes whole numbers and floats, which a program may have forbidden.
-        with jax.numpy_dtype_promotion("standard"):
-            direction, opt_state = optimiser.update(grads, opt_state, state.params)
-        rate = learning_rate(self.config, state.updates)
-        params = jax.tree.map(lambda p, d: p - rate * d, state.params, direction)
-        loss = tally.loss.policy + tally.loss.value + tally.loss.entropy
-        faults = guard.faults_of(loss, tally.gradient_norm, params)
-        nothing = jax.tree.map(jnp.zeros_like, tally)
-        new = params, opt_state, actors, tally
-        old = state.params, state.opt_state, state.actors, nothing
-        params, opt_state, actors, tally = guard.unless(faults, new, old)
-        next_state = replace(
-            state,
-            params=params,
-            opt_state=opt_state,
+        norm = optax.tree.norm(grads["policy"])
+        tally = replace(tally, gradient_norm=norm, updates=jnp.int32(1))
+        following = replace(
+            self._policy_step(state, grads["policy"]),
             actors=actors,
-            updates=state.updates + tally.updates,
+            critic=self._critic_step(state.critic, grads["critic"]),
         )
-        return next_state, replace(tally, faults=faults)
+        loss = tally.loss.policy + tally.loss.value + tally.loss.entropy
+        faults = guard.faults_of(loss, norm, self._weights(following))
+        nothing = jax.tree.map(jnp.zeros_like, tally)
+        following, tally = guard.unless(faults, (following, tally), (state, nothing))
+        following = replace(following, updates=state.updates + tally.updates)
+        return following, replace(tally, faults=faults)
+
+    def _weights(self, state: TrainState) -> dict[str, Any]:
+        """All that gradients are taken of: the policy's parameters, and a critic's of its own."""
+        return {"policy": state.params, "critic": state.critic and state.critic.params}
+
+    def _policy_step(self, state: TrainState, grads: Any) -> TrainState:
+        grads, opt_state = self._critic_alone(grads, state)
+        optimiser = make_optimiser(self.config)
+        rate = learning_rate(self.config, state.updates)
+        params, opt_state = stepped(optimiser, rate, state.params, grads, opt_state)
+        return replace(state, params=params, opt_state=opt_state)
+
+    def _critic_step(self, state: CriticState | None, grads: Any) -> CriticState | None:
+        if state is None:
+            return None
+        rate = self.config.critic_rate
+        return CriticState(*stepped(critic.optimiser(), rate, state.params, grads, state.opt_state))
 
     def _inputs(self, state: TrainState) -> tuple[Actors, Draws]:
         """Where an update's rollout starts, and all its random numbers."""
@@ -240,25 +258,28 @@ class Learner:
         return actors, draw(self.env, self.policy, keys, length, epoch)
 
     def _gradient(
-        self, params: Any, actors: Actors, draws: Draws, updates: chex.Array
+        self, weights: dict[str, Any], actors: Actors, draws: Draws, updates: chex.Array
     ) -> tuple[Any, tuple[Actors, Tally]]:
         """Gradient of the summed loss, and what the rollout left."""
         gradient, limit = jax.grad(self._objective, has_aux=True), self.config.max_grad_norm
         if limit is None or not self.config.clip_per_env:
-            return gradient(params, actors, draws, updates)
+            return gradient(weights, actors, draws, updates)
         lanes = one_environment_each(actors, draws)
-        grads, (actors, tallies) = jax.vmap(gradient, (None, 0, 0, None))(params, *lanes, updates)
+        grads, (actors, tallies) = jax.vmap(gradient, (None, 0, 0, None))(weights, *lanes, updates)
         grads = jax.vmap(partial(clip_by_global_norm, limit=limit))(grads)
         grads, tally = _added((grads, tallies))
         return grads, (jax.tree.map(lambda x: x[:, 0], actors), tally)
 
     def _objective(
-        self, params: Any, actors: Actors, draws: Draws, updates: chex.Array
+        self, weights: dict[str, Any], actors: Actors, draws: Draws, updates: chex.Array
     ) -> tuple[chex.Array, tuple[Actors, Tally]]:
-        config = self.config
+        config, params = self.config, weights["policy"]
         actors, trajectory = rollout(
             self.env, self.policy, params, actors, draws, config.detach_gap, self.unroll
         )
+        last = last_value(self.env, self.policy, params, actors)
+        if weights["critic"] is not None:
+            trajectory, last = self._valued(weights["critic"], trajectory, actors)
         if config.whole_episodes:
             valid = until_episode_end(trajectory, config.rollout_length)
         else:
@@ -266,12 +287,22 @@ class Learner:
         loss, parts = LOSSES[config.loss](
             trajectory,
             valid,
-            last_value(self.env, self.policy, params, actors),
+            last,
             config,
             annealed(config, updates),
             self.axis,
         )
         return loss, (jax.lax.stop_gradient(actors), tally_of(trajectory, valid, parts))
+
+    def _valued(
+        self, params: Any, trajectory: Trajectory, actors: Actors
+    ) -> tuple[Trajectory, chex.Array]:
+        """The trajectory with the values of a critic of its own, and that of the steps' end."""
+        shape = trajectory.value.shape
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), trajectory.env_state)
+        value = critic.values(self.env, params, flat).reshape(shape)
+        last = critic.values(self.env, params, actors.env_state)
+        return replace(trajectory, value=value), jax.lax.stop_gradient(last)
 
     def _critic_alone(self, grads: Any, state: TrainState) -> tuple[Any, Any]:
         """Gradient and optimiser memory of an update: in the first `critic_epochs` nothing for what
@@ -308,6 +339,20 @@ class Learner:
         if self.axis is not None:
             number = number + jax.lax.axis_index(self.axis) * num_envs
         return jax.vmap(partial(jax.random.fold_in, key))(number)
+
+
+def stepped(
+    optimiser: optax.GradientTransformation,
+    rate: chex.Numeric,
+    params: Any,
+    grads: Any,
+    opt_state: Any,
+) -> tuple[Any, Any]:
+    """Parameters and optimiser memory after a step of `rate`."""
+    # Its own arithmetic mixes whole numbers and floats, which a program may have forbidden.
+    with jax.numpy_dtype_promotion("standard"):
+        direction, opt_state = optimiser.update(grads, opt_state, params)
+    return jax.tree.map(lambda p, d: p - rate * d, params, direction), opt_state
 
 
 def one_environment_each(actors: Actors, draws: Draws) -> tuple[Actors, Draws]:
@@ -384,6 +429,8 @@ def make_learner(env: Environment, policy: Policy, config: LearnerConfig | None 
         raise ValueError(
             "loss 'hetnet' has no place for agents that come and go; use loss 'actor_critic'."
         )
-    if not policy.module.critic_parameters:  # a policy that does not say what its critic's is
+    if config.critic == "state":
+        critic.check_has_features(env)
+    elif not policy.module.critic_parameters:  # a policy that does not say what its critic's is
         config = replace(config, critic_epochs=0)
     return Learner(env, policy, config)

@@ -282,7 +282,8 @@ def compile_train(
 def state_specs() -> Any:
     """How a stacked `TrainState` lies on the mesh: all by seed, actors by environment too."""
     by_seed = P(SEEDS)
-    return TrainState(by_seed, by_seed, P(SEEDS, ENVS), by_seed, by_seed)  # type: ignore[arg-type]
+    specs: Any = dict.fromkeys(TrainState.__dataclass_fields__, by_seed)
+    return TrainState(**specs | {"actors": P(SEEDS, ENVS)})
 
 
 def place(states: TrainState, mesh: Mesh) -> TrainState:

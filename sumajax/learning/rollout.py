@@ -64,6 +64,7 @@ class Trajectory:
     agent_class: tuple[int, ...] = struct.field(pytree_node=False)  # per agent
     max_steps: int = struct.field(pytree_node=False)  # the task's step limit
     presence: Presence | None = None  # leaves (T, E, N); None where nobody ever leaves
+    env_state: Any = None  # leaves (T, E, ...): before the step, for a critic that is shown it
 
     @property
     def last(self) -> chex.Array:
@@ -71,9 +72,7 @@ class Trajectory:
         return self.terminated | self.truncated
 
 
-def start(
-    env: Environment, policy: Policy, keys: chex.PRNGKey, epoch: chex.Numeric = 0
-) -> Actors:
+def start(env: Environment, policy: Policy, keys: chex.PRNGKey, epoch: chex.Numeric = 0) -> Actors:
     """Fresh episodes of an epoch of training, one per key of `keys` (E,)."""
     num_envs = keys.shape[0]
     return Actors(
@@ -184,13 +183,14 @@ def rollout(
       unroll: steps that one turn of the compiled loop takes; changes no result.
     """
     if detach_gap is None:
-        actors, (_, trajectory) = unroll_steps(env, policy, params, actors, draws, unroll)
-        return actors, trajectory
+        actors, (before, trajectory) = unroll_steps(env, policy, params, actors, draws, unroll)
+        return actors, replace(trajectory, env_state=before.env_state)
     constant = jax.lax.stop_gradient(params)
     actors, (before, trajectory) = unroll_steps(env, policy, constant, actors, draws, unroll)
-    return actors, recompute_in_windows(
+    trajectory = recompute_in_windows(
         env, policy, params, before, draws.noise, trajectory, detach_gap, unroll
     )
+    return actors, replace(trajectory, env_state=before.env_state)
 
 
 def unroll_steps(

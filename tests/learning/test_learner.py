@@ -117,7 +117,9 @@ class TestGradient:
             assert config.team_reward > 0
             assert config.advantages == "centred"
             params, actors, draws, _ = in_float64(jax.jit(partial(gradient_inputs, tiny))())
-            ours, (_, tally) = jax.jit(tiny._gradient)(params, actors, draws, jnp.int32(0))
+            weights = {"policy": params, "critic": None}
+            ours, (_, tally) = jax.jit(tiny._gradient)(weights, actors, draws, jnp.int32(0))
+            ours = ours["policy"]
             following, now = jax.jit(partial(rollout, env, tiny.policy))(params, actors, draws)
             beyond = last_value(env, tiny.policy, params, following)
             individual = now.value + estimate_advantages(now, beyond, config)
@@ -156,7 +158,8 @@ class TestGradient:
             optimiser="rmsprop", max_grad_norm=None, learning_rate=0.1, **SHORT_EPOCH
         )
         state = fresh(0).replace(opt_state=make_state(tiny, fresh(0).params))
-        inputs = state.params, *tiny._inputs(state), state.updates
+        weights = {"policy": state.params, "critic": None}
+        inputs = weights, *tiny._inputs(state), state.updates
         sums, (_, tally) = jax.jit(tiny._gradient)(*inputs)
         stepped, _ = jax.jit(tiny.update)(state)
         assert int(tally.env_steps) == 4000
@@ -166,7 +169,7 @@ class TestGradient:
             return p - 0.1 * g / (np.sqrt(0.03 * g**2) + 1e-6)
 
         close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
-        jax.tree.map(close, stepped.params, jax.tree.map(expected, state.params, sums))
+        jax.tree.map(close, stepped.params, jax.tree.map(expected, state.params, sums["policy"]))
 
 
 def gradient_inputs(tiny):

@@ -1,0 +1,163 @@
+"""A critic of its own: shown the true state, sharing nothing with the policy."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import LastStepReward, Probe, ProbeState
+from trajectories import TINY_TASK, tiny_learner
+
+from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.learning import make_learner, parallel, preset
+from sumajax.learning.critic import StateCritic, values
+from sumajax.policies import make_policy
+from sumajax.upsampling import StateUpsampled
+
+SHORT_EPOCH = {"num_envs": 200, "rollout_length": 20, "critic": "state"}  # 5 updates
+
+
+@dataclass(frozen=True)
+class HiddenCue(LastStepReward):
+    """Pays the cue, which only a critic is shown, at the second of two steps."""
+
+    def reward(self, state, actions):
+        return super().reward(state, actions) * state.cue
+
+    def critic_features(self, state):
+        return jnp.stack([state.cue, state.time]).astype(jnp.float32)[None]
+
+
+def trained(epochs=1, policy="ic3net", **changes):
+    """A tiny learner, its start and what came of it."""
+    learner = tiny_learner(TINY_TASK, policy, **SHORT_EPOCH, **changes)
+    start = jax.jit(learner.init)(jax.random.key(0))
+    return start, *learner.train(start, epochs)
+
+
+def moved(before, after):
+    return any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (before, after)), strict=True))
+
+
+class TestWhatItLearns:
+    @pytest.mark.parametrize("policy", ["ic3net", "hetnet"])
+    def test_its_error_never_reaches_the_policy(self, policy):
+        start, end, _ = trained(policy=policy, policy_weight=0.0, entropy_weight=0.0)
+        assert not moved(start.params, end.params)
+        assert moved(start.critic.params, end.critic.params)
+
+    def test_the_policy_does_not_learn_from_its_own_value_any_more(self):
+        start, end, _ = trained()
+        core = [tree["params"]["core"] for tree in (start.params, end.params)]
+        assert moved(*(tree["action"] for tree in core))
+        assert not moved(*(tree["value"] for tree in core))
+
+    def test_alone_at_first(self):
+        start, middle, _ = trained(critic_epochs=1)
+        assert not moved(start.params, middle.params)
+        assert moved(start.critic.params, middle.critic.params)
+        learner = tiny_learner(TINY_TASK, "ic3net", critic_epochs=1, **SHORT_EPOCH)
+        end, _ = learner.train(middle, 1)
+        assert moved(start.params, end.params)
+
+    def test_it_knows_what_no_agent_sees(self):
+        env = HiddenCue()
+        config = preset("fast", "iric", critic="state", num_envs=50)
+        learner = make_learner(env, make_policy("iric", env, hidden=4, encoder="linear"), config)
+        state, _ = learner.train(jax.jit(learner.init)(jax.random.key(0)), 5)
+        cue, time = jnp.array([0, 0, 1, 1]), jnp.array([0, 1, 0, 1])
+        found = values(env, state.critic.params, ProbeState(cue, time))
+        expected = [[0.0], [0.0], [config.gamma], [1.0]]
+        np.testing.assert_allclose(found, expected, atol=0.05)
+
+    def test_what_the_learner_did_without_it_stays(self):
+        """The policy and its environments start as they do with the policy's own critic."""
+        start, *_ = trained()
+        own = tiny_learner(TINY_TASK, "ic3net", **{**SHORT_EPOCH, "critic": "policy"})
+        theirs = jax.jit(own.init)(jax.random.key(0))
+        assert theirs.critic is None
+        jax.tree.map(np.testing.assert_array_equal, start.params, theirs.params)
+        jax.tree.map(np.testing.assert_array_equal, start.actors, theirs.actors)
+
+
+class TestValues:
+    def test_of_all_agents_in_all_states(self):
+        env = PredatorPrey(size=4, num_predators=3)
+        states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 6))
+        features = jax.vmap(env.critic_features)(states)
+        params = StateCritic().init(jax.random.key(1), features)
+        found = values(env, params, states)
+        assert found.shape == (6, 3)
+        one = jax.tree.map(lambda x: x[2:3], states)
+        np.testing.assert_allclose(values(env, params, one)[0], found[2], rtol=1e-6)
+
+    def test_the_same_parameters_judge_any_team_and_grid(self):
+        learners = [
+            tiny_learner(env, **SHORT_EPOCH)
+            for env in (TINY_TASK, PredatorPrey(size=6, num_predators=5))
+        ]
+        shapes = [
+            jax.tree.map(jnp.shape, jax.eval_shape(learner.init, jax.random.key(0)).critic)
+            for learner in learners
+        ]
+        assert shapes[0] == shapes[1]
+
+    def test_an_upsampled_task_shows_what_the_task_shows(self):
+        env = PredatorPrey(size=4, num_predators=3)
+        state = env.reset(jax.random.key(0))
+        seen = StateUpsampled(env, 8).critic_features(state)
+        np.testing.assert_array_equal(seen, env.critic_features(state))
+
+
+class TestFeaturesOfPredatorCapturePrey:
+    ENV = PredatorCapturePrey(size=10, num_predators=2, num_capturers=1)
+
+    def test_worked_example(self):
+        """Prey at (4, 4): a predator on it, one three cells off, a capture agent beside it."""
+        env = self.ENV
+        state = env.state_at([(4, 5), (4, 7), (5, 4)], (4, 4))
+        state, _ = env.step(state, jnp.array([3, 4, 4]))
+        near = [[1, 1, 1], [0.9**3, 0.97**3, 0.99**3], [0.9, 0.97, 0.99]]
+        team = [(1 + 0.9**3 + 0.9) / 3, (1 + 0.97**3 + 0.97) / 3, 1, 1, 1 / 3, 1]
+        expected = [
+            [0.0, 0.0, *near[0], 1, 1, 1, 0, *team],
+            [0.0, -0.3, *near[1], 0, 1, 0, 0, *team],
+            [-0.1, 0.0, *near[2], 0, 0, 0, 1, *team],
+        ]
+        np.testing.assert_allclose(env.critic_features(state), expected, rtol=1e-5, atol=1e-6)
+
+    def test_capture_agents_that_see(self):
+        env = PredatorCapturePrey(num_predators=1, num_capturers=1, capture_vision=1)
+        state = env.state_at([(0, 0), (3, 4)], (4, 4))
+        sees, anybody = 7, 14
+        features = env.critic_features(state)
+        assert features[:, sees].tolist() == [0, 1]
+        assert features[:, anybody].tolist() == [1, 1]
+
+
+class TestErrors:
+    def test_a_task_that_shows_nothing_is_refused(self):
+        env = Probe()
+        with pytest.raises(ValueError, match="Probe has no critic_features; use critic 'policy'"):
+            make_learner(env, make_policy("iric", env), preset("fast", critic="state"))
+
+    def test_the_loss_of_hetnet_has_critics_of_its_own(self):
+        with pytest.raises(ValueError, match="loss 'hetnet' needs critic=policy"):
+            preset("paper", "hetnet", critic="state")
+
+    def test_unknown(self):
+        with pytest.raises(ValueError, match="critic 'central' is unknown; choose one of policy, "):
+            preset("fast", critic="central")
+
+
+def test_several_seeds_are_each_alone():
+    learner = tiny_learner(TINY_TASK, **SHORT_EPOCH)
+    mesh = parallel.make_mesh(2, 200, devices=1)
+    states = parallel.place(parallel.init_seeds(learner, [0, 5]), mesh)
+    states, _ = parallel.make_train(learner, mesh, epochs=1)(states)
+    close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
+    for i, seed in enumerate([0, 5]):
+        alone, _ = learner.train(jax.jit(learner.init)(jax.random.key(seed)), 1)
+        jax.tree.map(close, alone.critic, jax.tree.map(lambda x, i=i: x[i], states.critic))
