@@ -6,7 +6,7 @@ import pytest
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import preset
-from sumajax.learning.scaling import after_transfer, crossing, share_of_reference
+from sumajax.learning.scaling import after_transfer, crossing, for_stage, share_of_reference
 from sumajax.upsampling import StateUpsampled
 
 TEN = PredatorPrey(size=10, num_predators=5, max_steps=200)
@@ -32,6 +32,25 @@ class TestSize:
     def test_all_classes_count(self):
         env = PredatorCapturePrey(size=20, num_predators=6, num_capturers=4)
         assert share_of_reference(env) == 1 / 4
+
+
+class TestHorizon:
+    @pytest.mark.parametrize(("env", "gamma"), [(TEN, 0.95), (TWENTY, 0.975), (FORTY, 0.9875)])
+    def test_a_critic_of_its_own_sees_as_far_as_the_grid(self, env, gamma):
+        for transferred in (False, True):
+            config = for_stage(preset("fast", critic="state"), env, 10, transferred=transferred)
+            assert config.gamma == pytest.approx(gamma)
+            again = for_stage(config, env, 10, transferred=transferred)
+            assert again == config
+
+    def test_a_longer_one_that_was_asked_for_stays(self):
+        config = preset("fast", critic="state", gamma=0.99)
+        assert for_stage(config, TWENTY, 10).gamma == 0.99
+
+    @pytest.mark.parametrize("changes", [{}, {"critic": "state", "scale_by_size": False}])
+    def test_otherwise_the_discount_is_that_of_the_preset(self, changes):
+        config = preset("fast", **changes)
+        assert for_stage(config, FORTY, 10, transferred=True).gamma == 0.95
 
 
 class TestAfterTransfer:
