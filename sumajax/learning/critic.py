@@ -1,8 +1,9 @@
 """A critic of its own, that is shown the true state.
 
 A critic is needed while a policy is trained and never afterwards, so it need not make do with what
-the agents know: `critic_features` of the task shows it where everything is. It shares no parameter
-with the policy, which stays as it was brought while the critic learns a new task.
+the agents know: `critic_features` of the task shows it where everything is, and `memory` of the
+policy what each agent remembers. It shares no parameter with the policy, which stays as it was
+brought while the critic learns a new task.
 
 Source: Pinto et al. 2018 (asymmetric actor-critic); Lowe et al. 2017 (a critic of all agents).
 """
@@ -17,10 +18,12 @@ from flax import linen as nn
 from flax import struct
 
 from sumajax.environments.types import Environment
+from sumajax.learning.rollout import Actors
 from sumajax.policies.layers import Dense
+from sumajax.policies.types import Policy
 
 HIDDEN = 64
-"""Width of both hidden layers; the features are a dozen numbers."""
+"""Width of both hidden layers."""
 
 
 @struct.dataclass
@@ -36,7 +39,7 @@ class StateCritic(nn.Module):
 
     @nn.compact
     def __call__(self, features: chex.Array) -> chex.Array:
-        """(..., N, F) of `critic_features` -> (..., N) float32, expected return of each agent."""
+        """(..., N, F) of `shown` -> (..., N) float32, expected return of each agent."""
         hidden = nn.tanh(Dense(HIDDEN)(features))
         hidden = nn.tanh(Dense(HIDDEN)(hidden))
         return Dense(1)(hidden)[..., 0]
@@ -51,10 +54,10 @@ def check_has_features(env: Environment) -> None:
         )
 
 
-def init_critic(env: Environment, key: chex.PRNGKey) -> CriticState:
-    """A fresh critic for `env`."""
-    features = jax.eval_shape(lambda: env.critic_features(env.reset(key)))  # type: ignore[attr-defined]
-    params = StateCritic().init(key, jnp.zeros(features.shape, features.dtype))
+def init_critic(env: Environment, policy: Policy, actors: Actors, key: chex.PRNGKey) -> CriticState:
+    """A fresh critic for such `actors`."""
+    like = jax.eval_shape(lambda: shown(env, policy, actors))
+    params = StateCritic().init(key, jnp.zeros(like.shape, like.dtype))
     return CriticState(params, optimiser().init(params))
 
 
@@ -63,8 +66,14 @@ def optimiser() -> optax.GradientTransformation:
     return optax.flatten(optax.scale_by_adam())
 
 
-def values(env: Environment, params: Any, env_states: Any) -> chex.Array:
-    """(B, N) of states with leaves (B, ...)."""
-    features = jax.vmap(env.critic_features)(env_states)  # type: ignore[attr-defined]
+def values(env: Environment, policy: Policy, params: Any, actors: Actors) -> chex.Array:
+    """(B, N) of actors with leaves (B, ...)."""
+    return cast(chex.Array, StateCritic().apply(params, shown(env, policy, actors)))
+
+
+def shown(env: Environment, policy: Policy, actors: Actors) -> chex.Array:
+    """(B, N, F) all that a critic reads; no gradient goes back into the agents' memory."""
+    features = jax.vmap(env.critic_features)(actors.env_state)  # type: ignore[attr-defined]
     chex.assert_rank(features, 3)
-    return cast(chex.Array, StateCritic().apply(params, features))
+    memory = jax.lax.stop_gradient(policy.module.memory(actors.carry))
+    return features if memory is None else jnp.concatenate([features, memory], axis=-1)

@@ -188,7 +188,9 @@ class Learner:
             actors=actors,
             key=key,
             updates=jnp.int32(0),
-            critic=critic.init_critic(self.env, critic_key) if own_critic else None,
+            critic=critic.init_critic(self.env, self.policy, actors, critic_key)
+            if own_critic
+            else None,
         )
 
     @partial(jax.jit, static_argnums=(0, 2))
@@ -299,9 +301,9 @@ class Learner:
     ) -> tuple[Trajectory, chex.Array]:
         """The trajectory with the values of a critic of its own, and that of the steps' end."""
         shape = trajectory.value.shape
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), trajectory.env_state)
-        value = critic.values(self.env, params, flat).reshape(shape)
-        last = critic.values(self.env, params, actors.env_state)
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), trajectory.before)
+        value = critic.values(self.env, self.policy, params, flat).reshape(shape)
+        last = critic.values(self.env, self.policy, params, actors)
         return replace(trajectory, value=value), jax.lax.stop_gradient(last)
 
     def _critic_alone(self, grads: Any, state: TrainState) -> tuple[Any, Any]:

@@ -64,7 +64,7 @@ class Trajectory:
     agent_class: tuple[int, ...] = struct.field(pytree_node=False)  # per agent
     max_steps: int = struct.field(pytree_node=False)  # the task's step limit
     presence: Presence | None = None  # leaves (T, E, N); None where nobody ever leaves
-    env_state: Any = None  # leaves (T, E, ...): before the step, for a critic that is shown it
+    before: Actors | None = None  # leaves (T, E, ...): what each step began with
 
     @property
     def last(self) -> chex.Array:
@@ -184,13 +184,13 @@ def rollout(
     """
     if detach_gap is None:
         actors, (before, trajectory) = unroll_steps(env, policy, params, actors, draws, unroll)
-        return actors, replace(trajectory, env_state=before.env_state)
+        return actors, replace(trajectory, before=before)
     constant = jax.lax.stop_gradient(params)
     actors, (before, trajectory) = unroll_steps(env, policy, constant, actors, draws, unroll)
     trajectory = recompute_in_windows(
         env, policy, params, before, draws.noise, trajectory, detach_gap, unroll
     )
-    return actors, replace(trajectory, env_state=before.env_state)
+    return actors, replace(trajectory, before=before)
 
 
 def unroll_steps(

@@ -470,6 +470,10 @@ class HetNet(PolicyModule):
         view = jnp.zeros((*batch_shape, self.team.class_size(0), VIEW_FEATURES), jnp.float32)
         return HetNetCarry(state, state, view, view)
 
+    def memory(self, carry: HetNetCarry) -> chex.Array:
+        blind = [(0, 0)] * (carry.h_obs.ndim - 2) + [(0, self.team.class_size(1)), (0, 0)]
+        return jnp.concatenate([carry.h_state, jnp.pad(carry.h_obs, blind)], axis=-1)
+
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         shape = (*batch_shape, self.team.num_agents, self.team.num_actions)
         action_key, bit_key = jax.random.split(key)

@@ -165,6 +165,9 @@ class IC3Net(PolicyModule):
         gate = jnp.full(shape, float(self.communicates and not self.gated), zeros.dtype)
         return IC3NetCarry(zeros, zeros, gate)
 
+    def memory(self, carry: IC3NetCarry) -> chex.Array:
+        return carry.h
+
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         shape = (*batch_shape, self.team.num_agents)
         action_key, gate_key = jax.random.split(key)

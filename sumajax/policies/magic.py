@@ -245,6 +245,9 @@ class MAGIC(PolicyModule):
         zeros = jnp.zeros((*batch_shape, self.team.num_agents, self.hidden), jnp.float32)
         return MAGICCarry(zeros, zeros)
 
+    def memory(self, carry: MAGICCarry) -> chex.Array:
+        return carry.h
+
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         n, settings = self.team.num_agents, SETTINGS[self.setting]
         graphs = 2 if settings["second_graph"] else 1

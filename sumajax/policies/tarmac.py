@@ -234,6 +234,9 @@ class TarMAC(PolicyModule):
         zeros = jnp.zeros((*shape, self.hidden), jnp.float32)
         return IC3NetCarry(zeros, zeros, jnp.full(shape, float(not self.gated), zeros.dtype))
 
+    def memory(self, carry: IC3NetCarry) -> chex.Array:
+        return carry.h
+
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         shape = (*batch_shape, self.team.num_agents)
         action_key, gate_key = jax.random.split(key)

@@ -150,6 +150,11 @@ class PolicyModule(nn.Module, ABC):
     def sample_noise(self, key: chex.PRNGKey, batch_shape: tuple[int, ...]) -> Any:
         """All the random numbers of `__call__`, so that a rollout can draw them in one go."""
 
+    def memory(self, carry: Any) -> chex.Array | None:
+        """(..., N, H) float32: what each agent remembers, for a critic of its own
+        (`learning.critic`); None where it is not said."""
+        return None
+
     def encode_and_step(self, carry: Any, obs: Observation, noise: Any) -> tuple[Any, PolicyOutput]:
         """`__call__` on the state tensors themselves: the direct path, for any state."""
         flat = jnp.reshape(obs.state, (-1, *obs.state.shape[-3:]))

@@ -12,8 +12,11 @@ from trajectories import TINY_TASK, tiny_learner
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import make_learner, parallel, preset
-from sumajax.learning.critic import StateCritic, values
+from sumajax.learning.critic import init_critic, shown, values
+from sumajax.learning.rollout import start
 from sumajax.policies import make_policy
+from sumajax.policies.ic3net import IC3Net
+from sumajax.policies.types import PolicyModule
 from sumajax.upsampling import StateUpsampled
 
 SHORT_EPOCH = {"num_envs": 200, "rollout_length": 20, "critic": "state"}  # 5 updates
@@ -68,7 +71,10 @@ class TestWhatItLearns:
         learner = make_learner(env, make_policy("iric", env, hidden=4, encoder="linear"), config)
         state, _ = learner.train(jax.jit(learner.init)(jax.random.key(0)), 5)
         cue, time = jnp.array([0, 0, 1, 1]), jnp.array([0, 1, 0, 1])
-        found = values(env, state.critic.params, ProbeState(cue, time))
+        actors = state.actors.replace(
+            env_state=ProbeState(cue, time), carry=learner.policy.initial_carry((4,))
+        )
+        found = values(env, learner.policy, state.critic.params, actors)
         expected = [[0.0], [0.0], [config.gamma], [1.0]]
         np.testing.assert_allclose(found, expected, atol=0.05)
 
@@ -83,15 +89,28 @@ class TestWhatItLearns:
 
 
 class TestValues:
-    def test_of_all_agents_in_all_states(self):
-        env = PredatorPrey(size=4, num_predators=3)
-        states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 6))
-        features = jax.vmap(env.critic_features)(states)
-        params = StateCritic().init(jax.random.key(1), features)
-        found = values(env, params, states)
+    @pytest.mark.parametrize("policy", ["ic3net", "magic", "hetnet", "tarmac"])
+    @pytest.mark.parametrize("classes", [(3, 0), (2, 1)])
+    def test_of_all_agents_from_the_true_state_and_what_they_remember(self, policy, classes):
+        env = PredatorCapturePrey(4, *classes) if classes[1] else PredatorPrey(4, classes[0])
+        made = make_policy(policy, env)
+        actors = start(env, made, jax.random.split(jax.random.key(0), 6))
+        params = init_critic(env, made, actors, jax.random.key(1)).params
+        found = values(env, made, params, actors)
         assert found.shape == (6, 3)
-        one = jax.tree.map(lambda x: x[2:3], states)
-        np.testing.assert_allclose(values(env, params, one)[0], found[2], rtol=1e-6)
+        one = jax.tree.map(lambda x: x[2:3], actors)
+        np.testing.assert_allclose(values(env, made, params, one)[0], found[2], rtol=1e-6)
+        remembering = actors.replace(carry=jax.tree.map(jnp.ones_like, actors.carry))
+        assert (values(env, made, params, remembering) != found).all()
+
+    def test_a_policy_that_does_not_say_what_it_remembers_is_judged_by_the_state(self):
+        env = PredatorPrey(size=4, num_predators=3)
+        made = make_policy("ic3net", env)
+        actors = start(env, made, jax.random.split(jax.random.key(0), 6))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(IC3Net, "memory", PolicyModule.memory)
+            seen = shown(env, made, actors)
+        np.testing.assert_array_equal(seen, jax.vmap(env.critic_features)(actors.env_state))
 
     def test_the_same_parameters_judge_any_team_and_grid(self):
         learners = [
