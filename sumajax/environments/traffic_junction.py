@@ -118,6 +118,7 @@ class TrafficJunction:
     channels: ClassVar[tuple[str, ...]] = ("road", "cars", "outside", "last action")
     num_actions: ClassVar[int] = 2
     agents_leave: ClassVar[bool] = True
+    largest_reward: ClassVar[float] = -COLLISION_REWARD
 
     def __post_init__(self) -> None:
         plain_fields(self)

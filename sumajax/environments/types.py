@@ -49,12 +49,14 @@ class Environment(Protocol):
     A domain with chance in its steps takes a part of the key of `reset` into its state and splits
     it anew in every `step`: environments side by side, steps and episodes then all draw apart.
 
-    Optional functions, used where a domain has them: `shortest_steps(state)`, () int32, the fewest
+    Optional, used where a domain has them: `shortest_steps(state)`, () int32, the fewest
     steps that the team could still need; `sparse_states()`, the `states.SparseStates` that
     `state_table` lists, for large grids, whose table grows with the square of the cells;
     `critic_features(state)`, (N, F) float32, what a critic of its own is shown in training: what
     tells how each agent will fare, seen by anybody or not, in numbers that mean the same on any
     grid and in any team;
+    `largest_reward`, a constant, the size of the largest reward that a step has for an agent, where
+    a task does not pay in Predator-Prey's hundredths (`learning.rewards`);
     `reset_in_epoch(key, epoch)`, a fresh episode of an epoch of training, of a task that becomes
     harder while it is learnt (see `resets`).
     """
