@@ -3,8 +3,8 @@
 An entropy bonus, a critic's weight and a clip are numbers beside rewards: what keeps a policy open
 where a step costs 0.05 is nothing where a collision costs 10, and there the policy settles on the
 first thing that collides less, long before it has seen what giving way would do. So a task says
-what its largest reward is, and the learner measures all of them by it. See docs/settings.md, Traffic
-Junction.
+what its largest reward is, and the learner measures all of them by it (docs/settings.md, Traffic
+Junction).
 """
 
 from sumajax.environments.types import Environment

@@ -348,7 +348,6 @@ class TestCurriculum:
         env = TrafficJunction(arrival_rate=0.1, final_arrival_rate=0.2, rate_epochs=(2, 6))
         np.testing.assert_allclose(env.rates([2, 2, 3, 1]), [0.12, 0.12, 0.14, 0.14])
 
-
     def test_an_episode_is_at_the_last_rate_or_at_that_of_its_epoch(self):
         env = TrafficJunction(arrival_rate=0.1, final_arrival_rate=0.2, rate_epochs=(2, 6))
         assert env.last_arrival_rate == 0.2

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import jax
-import numpy as np
 import pytest
 from probes import Probe
 from trajectories import TINY_TASK, tiny_learner
@@ -55,12 +54,14 @@ def test_what_is_learnt_does_not_depend_on_what_a_task_pays_in():
 
     same, _ = one_update(Small())
     other, _ = one_update(Pays())
-    for a, b, c in zip(*map(jax.tree.leaves, (stated, same, other)), strict=True):
-        if a.dtype == np.float32 and a.shape != (10, 1):  # but for what was earned
-            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
-    assert any(
-        (a != c).any() for a, c in zip(*map(jax.tree.leaves, (stated.params, other.params)))
-    )
+    assert apart(stated.params, same.params) < 1e-6
+    assert apart(stated.opt_state, same.opt_state) < 1e-6
+    assert apart(stated.params, other.params) > 1e-4
+
+
+def apart(a, b) -> float:
+    """The largest difference of two numbers in the same place."""
+    return max(jax.tree.leaves(jax.tree.map(lambda x, y: float(abs(x - y).max()), a, b)))
 
 
 def test_returns_are_reported_as_they_were_paid():
