@@ -14,7 +14,7 @@ from flax import struct
 from sumajax import checkpoint
 from sumajax.checkpoint import CheckpointError
 from sumajax.description import rebuild_policy, rebuild_task
-from sumajax.environments.types import Environment, Observation
+from sumajax.environments.types import Environment, Observation, figure_names, measured
 from sumajax.keys import key_of
 from sumajax.learning.rollout import Actors, act, hand_on, presence_in, select, state_features
 from sumajax.policies.types import Policy
@@ -36,6 +36,17 @@ class Evaluation:
     steps_taken: chex.Array  # (episodes,) int32; the step limit where the team never finished
     success: chex.Array  # (episodes,) bool
     episode_return: chex.Array  # (episodes,) float32: undiscounted, mean over agents
+    measured: chex.Array  # (episodes, F, 2) float32 of the domain's own figures: amount and count
+
+    def figures(self, env: Environment) -> dict[str, float]:
+        """The domain's own figures over all these episodes; NaN where there was nothing to count.
+
+        Args:
+          env: the task that was played, which names them.
+        """
+        amount, count = np.asarray(self.measured, np.float64).sum(0).T
+        values = np.divide(amount, count, out=np.full(len(count), np.nan), where=count > 0)
+        return dict(zip(figure_names(env), values.tolist(), strict=True))
 
 
 def held_out_keys(episodes: int = EPISODES) -> chex.PRNGKey:
@@ -103,6 +114,7 @@ class _Queue:
     actors: Actors  # leaves (L, ...)
     episode: chex.Array  # (L,) int32 the episode a lane plays; past the last one: none
     following: chex.Array  # () int32 the next episode to start
+    measured: chex.Array  # (L, F, 2) float32 so far, of the episodes in progress
     result: Evaluation
     time: chex.Array  # () int32 steps so far, of all lanes
 
@@ -115,7 +127,7 @@ def _play(
     A team that gets stuck plays on to the step limit. Were all starts played side by side, it would
     hold up everybody, so a lane whose episode ends takes the next start that is left.
     """
-    keys = held_out_keys(episodes)
+    keys, number = held_out_keys(episodes), len(figure_names(env))
     starts, lanes = jax.vmap(env.reset)(keys), min(LANES, episodes)
     first = Actors(
         env_state=jax.tree.map(lambda x: x[:lanes], starts),
@@ -133,7 +145,9 @@ def _play(
         episode_return = actors.episode_return + transition.reward
         carry = hand_on(policy, carry, presence_in(env, actors.env_state, transition, env_state))
         done = transition.terminated | transition.truncated
-        now = Evaluation(transition.steps_taken, transition.success, episode_return.mean(-1))
+        own = jax.vmap(partial(measured, env))(actors.env_state, transition, env_state)
+        own = queue.measured + own
+        now = Evaluation(transition.steps_taken, transition.success, episode_return.mean(-1), own)
         # A row past the end is dropped.
         row = jnp.where(done, queue.episode, episodes)
         result = jax.tree.map(lambda x, y: x.at[row].set(y, mode="drop"), queue.result, now)
@@ -145,15 +159,18 @@ def _play(
             carry=select(done, policy.initial_carry((lanes,)), carry),
             episode_return=jnp.where(done[:, None], 0.0, episode_return),
         )
-        return _Queue(actors, episode, queue.following + ended[-1], result, queue.time + 1)
+        own = jnp.where(done[:, None, None], 0.0, own)
+        return _Queue(actors, episode, queue.following + ended[-1], own, result, queue.time + 1)
 
     result = Evaluation(
         steps_taken=jnp.zeros(episodes, jnp.int32),
         success=jnp.zeros(episodes, bool),
         episode_return=jnp.zeros(episodes, jnp.float32),
+        measured=jnp.zeros((episodes, number, 2), jnp.float32),
     )
     episode = jnp.arange(lanes, dtype=jnp.int32)
-    queue = _Queue(first, episode, jnp.int32(lanes), result, jnp.int32(0))
+    own = jnp.zeros((lanes, number, 2), jnp.float32)
+    queue = _Queue(first, episode, jnp.int32(lanes), own, result, jnp.int32(0))
     return jax.lax.while_loop(unfinished, body, queue).result
 
 

@@ -1,17 +1,34 @@
 """The domains that the command line knows: a line each."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
 from sumajax.environments.types import Environment
 
 SMALL_SIDE, SMALL_LIMIT = 5, 80
 LARGE_LIMIT, STEPS_PER_SIDE = 200, 10
 """Step limits of grids: the paper's 80 on 5x5 and 200 on 10x10 (section V); from 20x20 on ten steps
 for each cell of a side, several times the way across."""
+
+
+def grid_of(task: Any, shape: tuple[int, int]) -> Any:
+    """The field `size` of a task on a grid of that shape."""
+    return shape[0] if shape[0] == shape[1] else shape
+
+
+def junction_of(task: TrafficJunction, shape: tuple[int, int]) -> int:
+    """The same of a junction, whose `size` is the original's argument.
+
+    Raises:
+      ValueError: for unequal sides.
+    """
+    rows, columns = shape
+    if rows != columns:
+        raise ValueError(f"a junction has equal sides, got {grid_label(shape)}; give one number.")
+    return rows - (task.shape[0] - task.size)
 
 
 @dataclass(frozen=True)
@@ -24,6 +41,8 @@ class Domain:
       team: fields of the task that are the team's sizes, in the order they are given in, as 3+2.
       members: what they are called.
       policy: what is trained if nothing is said.
+      policy_settings: as the domain's publications have them, for the policies that know them.
+      size_of: of a task and a shape, the field `size` that gives the task a grid of that shape.
     """
 
     experiment: str
@@ -32,6 +51,8 @@ class Domain:
     team: tuple[str, ...]
     members: str
     policy: str = "ic3net"
+    policy_settings: tuple[tuple[str, Any], ...] = ()
+    size_of: Callable[[Any, tuple[int, int]], Any] = grid_of
 
     @property
     def task(self) -> type:
@@ -53,6 +74,16 @@ DOMAINS: dict[str, Domain] = {
         ("num_predators", "num_capturers"),
         "predators+capture agents",
         policy="hetnet",
+    ),
+    "tj": Domain(
+        "tj_transfer",
+        TrafficJunction("easy"),
+        TrafficJunction("medium"),
+        ("num_cars",),
+        "cars",
+        # The published program takes IC3Net's gates for open in this domain.
+        policy_settings=(("talk_always", True),),
+        size_of=junction_of,
     ),
 }
 
@@ -113,9 +144,8 @@ def with_size(
     task: Any, size: tuple[int, int], team: dict[str, int], max_steps: int | None = None
 ) -> Any:
     """A task like `task` on another grid with another team."""
-    plain = size[0] if size[0] == size[1] else size
     limit = task.max_steps if max_steps is None else max_steps
-    return replace(task, size=plain, max_steps=limit, **team)
+    return replace(task, size=domain_of(task).size_of(task, size), max_steps=limit, **team)
 
 
 def team_label(task: Any) -> str:

@@ -31,9 +31,11 @@ from sumajax.environments.types import Environment
 from sumajax.environments.wrapper import rewrapped, unwrapped
 from sumajax.evaluation import EPISODES, Agent, load_agent, shortest_path_steps
 from sumajax.experiment.records import EVALUATION_SEED, held_out
+from sumajax.experiment.summary import figure_text
 from sumajax.keys import key_of
 from sumajax.learning import parallel
 from sumajax.policies import Policy
+from sumajax.reporting.metrics import EVAL
 from sumajax.transfer import stage_directories
 from sumajax.upsampling import StateUpsampled
 
@@ -240,7 +242,15 @@ def table(report: dict[str, Any]) -> list[dict[str, Any]]:
                 row[name] = f"{steps:.2f} {success:6.1%}"
             bound = entry["shortest_path_steps"]
             rows.append(row | {"bound": None if bound is None else f"{bound:.2f}"})
+            rows += [_figure_row(entry, mode, name) for name in modes[mode] if name not in EVAL]
     return rows
+
+
+def _figure_row(entry: dict[str, Any], mode: str, figure: str) -> dict[str, Any]:
+    """A figure of the domain's own."""
+    values = {name: figure_text(of[mode][figure]) for name, of in entry["policies"].items()}
+    words = f"{mode}, {figure.replace('_', ' ')}"
+    return {"grid, team": entry["label"], "actions": words, **values, "bound": None}
 
 
 def label(task: Any) -> str:

@@ -13,6 +13,7 @@ from sumajax.cli.domains import (
     Domain,
     domain_of,
     grid_label,
+    grid_of,
     parse_size,
     parse_team,
     step_limit,
@@ -20,7 +21,8 @@ from sumajax.cli.domains import (
     with_size,
 )
 from sumajax.cli.options import chosen_preset, keep_compiled, parse, plain_errors
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
+from sumajax.environments.roads import Difficulty
 from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES
 from sumajax.experiment.directory import plain
@@ -162,6 +164,15 @@ class TransferOptions:
             return tuple(_sized(self))
         return (self.source, self.target)
 
+    def like(self, place: int) -> Any:
+        """The task whose settings that stage of --sizes has, but for grid, team and step limit."""
+        return self.target
+
+    def limit(self, place: int, size: tuple[int, int]) -> int:
+        """Step limit of that stage of --sizes if none is given."""
+        own = {task.shape: task.max_steps for task in (self.source, self.target)}
+        return own.get(size, step_limit(size))
+
     def experiment(self) -> Experiment:
         """The plan that these options say.
 
@@ -237,8 +248,62 @@ class PCPTransfer(TransferOptions):
     policy: str = DOMAINS["pcp"].policy
 
 
+@dataclass(frozen=True)
+class TJTransfer(TransferOptions):
+    """Traffic Junction: pre-train on a small junction with upsampled state, transfer to a large
+    one, directly or by stages between, and compare with training there from scratch.
+    """
+
+    domain: ClassVar[str] = "tj"
+
+    source: TrafficJunction = DOMAINS["tj"].source  # type: ignore[assignment]
+    """The small task, whose state is upsampled to the target's size."""
+    target: TrafficJunction = DOMAINS["tj"].target  # type: ignore[assignment]
+    """The large task."""
+    difficulties: tuple[Difficulty, ...] = ()
+    """Of all stages, as easy medium, the last is the target; what is not said by --sizes, --teams
+    and --max-steps, and the arrival rates, is published for each. With --sizes alone all stages
+    are of the target's."""
+    sizes: tuple[str, ...] = ()
+    """Sides of the grids of all stages, as 7 14 for easy medium, or 9 18 for hard hard."""
+    teams: tuple[str, ...] = ()
+    """Cars of each stage, how many there can be at once; those of its difficulty if not given."""
+    max_steps: tuple[int, ...] = ()
+    """Step limit of each stage; that of its difficulty if not given."""
+    threshold: float = 0.8
+    """Success that counts as solved in the comparison."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.difficulties and not self.sizes:
+            shapes = [TrafficJunction(difficulty).shape for difficulty in self.difficulties]
+            object.__setattr__(self, "sizes", tuple(grid_label(shape) for shape in shapes))
+        if len(self.difficulties) not in (0, len(self.sizes)):
+            raise ValueError(
+                f"difficulties has {len(self.difficulties)} values and sizes {len(self.sizes)}; "
+                "give as many of each."
+            )
+        if self.sizes and not self.teams:
+            cars = [team_label(self.like(place)) for place in range(len(self.sizes))]
+            object.__setattr__(self, "teams", tuple(cars))
+
+    def like(self, place: int) -> TrafficJunction:
+        """The source's settings or the target's, of whichever has the difficulty; or published."""
+        if not self.difficulties:
+            return self.target
+        difficulty = self.difficulties[place]
+        for task in (self.target, self.source):
+            if task.difficulty == difficulty:
+                return task
+        of_all = {name: getattr(self.target, name) for name in ("vision", "reset_last_action")}
+        return TrafficJunction(difficulty, **of_all)
+
+    def limit(self, place: int, size: tuple[int, int]) -> int:
+        return self.like(place).max_steps
+
+
 OPTIONS: dict[str, type[TransferOptions]] = {
-    options.domain: options for options in (PPTransfer, PCPTransfer)
+    options.domain: options for options in (PPTransfer, PCPTransfer, TJTransfer)
 }
 """Of `sumajax transfer DOMAIN`."""
 
@@ -251,7 +316,7 @@ def main(domain: str, arguments: list[str] | None = None) -> None:
         chosen, policy = chosen_preset(given, options.policy)
         # The subclass gives both tasks a default.
         default = options(  # type: ignore[call-arg]
-            learner=preset(chosen, policy), policy_settings=settings_of(policy)
+            learner=preset(chosen, policy), policy_settings=settings_of(policy, DOMAINS[domain])
         )
         prog = None if arguments is None else f"sumajax transfer {domain}"
         config = parse(options, default, given, NOTE, prog=prog)
@@ -263,13 +328,14 @@ def main(domain: str, arguments: list[str] | None = None) -> None:
             raise SystemExit(STOPPED)
 
 
-def settings_of(policy: str) -> dict[str, Any]:
-    """Every setting of a policy of the package that has a default, with it."""
+def settings_of(policy: str, domain: Domain) -> dict[str, Any]:
+    """Every setting of a policy of the package that has a default, with what it is in a domain."""
     if policy not in POLICIES:
         return {}
     module, variant = POLICIES[policy]
     fixed = {"team", "parent", "name", "encoder", *variant}
-    return {f.name: f.default for f in fields(module) if f.init and f.name not in fixed}
+    settings = {f.name: f.default for f in fields(module) if f.init and f.name not in fixed}
+    return settings | {k: v for k, v in domain.policy_settings if k in settings}
 
 
 def described(options: TransferOptions) -> dict[str, Any]:
@@ -293,12 +359,11 @@ def _sized(options: TransferOptions) -> list[Environment]:
             )
     if not options.teams:
         raise ValueError(f"sizes {' '.join(options.sizes)} need --teams, as many.")
-    own = {task.shape: task.max_steps for task in (options.source, options.target)}
-    limits = options.max_steps or [own.get(size, step_limit(size)) for size in sizes]
+    limits = options.max_steps or [options.limit(*stage) for stage in enumerate(sizes)]
     teams = [parse_team(text, domain) for text in options.teams]
     return [
-        with_size(options.target, size, team, limit)
-        for size, team, limit in zip(sizes, teams, limits, strict=True)
+        with_size(options.like(place), size, team, limit)
+        for place, (size, team, limit) in enumerate(zip(sizes, teams, limits, strict=True))
     ]
 
 
@@ -335,4 +400,4 @@ def _seen(options: TransferOptions, task: Any, place: int) -> Environment:
         return task
     at = task if options.upsampling == "none" else options.tasks[-1]
     fill: Fill = "corner" if options.upsampling == "corner" else "blocks"
-    return StateUpsampled(task, at.size, options.scale, fill)
+    return StateUpsampled(task, grid_of(at, at.shape), options.scale, fill)

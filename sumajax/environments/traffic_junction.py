@@ -118,6 +118,9 @@ class TrafficJunction:
     channels: ClassVar[tuple[str, ...]] = ("road", "cars", "outside", "last action")
     num_actions: ClassVar[int] = 2
     agents_leave: ClassVar[bool] = True
+    largest_reward: ClassVar[float] = -COLLISION_REWARD
+    merit: ClassVar[str] = "success"
+    figure_names: ClassVar[tuple[str, ...]] = ("collisions_per_car", "mean_delay", "cars_through")
 
     def __post_init__(self) -> None:
         plain_fields(self)
@@ -214,6 +217,9 @@ class TrafficJunction:
 
     def collided(self, state: State) -> chex.Array:
         return collided(self, state)
+
+    def measure(self, state: State, transition: Transition, following: State) -> chex.Array:
+        return measure(self, state, transition, following)
 
     def rates(self, epochs: ArrayLike) -> np.ndarray:
         return rates(self, epochs)
@@ -367,6 +373,26 @@ def collided(env: TrafficJunction, state: State) -> chex.Array:
     """(N,) bool: cars that share their cell."""
     cell = grid.cell_index(jnp.asarray(env.roads.cell)[state.place], env.shape)
     return ((cell[:, None] == cell).sum(-1) > 1) & state.alive
+
+
+def measure(
+    env: TrafficJunction, state: State, transition: Transition, following: State
+) -> chex.Array:
+    """(3, 2) float32: amount and count of what success alone does not tell.
+
+    * Collisions per car: steps in which a car shares its cell, of all that came.
+    * Mean delay: steps that a car was in the junction beyond its route's length, of all that came.
+      Nothing but its own brake holds a car up, so these are the steps it braked in.
+    * Cars through: cars that left, per episode.
+    """
+    left = transition.left
+    assert left is not None
+    stays = state.alive & ~left
+    came = (following.alive & ~stays).sum()
+    waits = (stays & (following.place == state.place)).sum()
+    collisions = collided(env, following).sum()
+    pairs = [(collisions, came), (waits, came), (left.sum(), transition.truncated)]
+    return jnp.stack([jnp.stack(pair).astype(jnp.float32) for pair in pairs])
 
 
 def rates(env: TrafficJunction, epochs: ArrayLike) -> np.ndarray:

@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import chex
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
@@ -49,12 +50,17 @@ class Environment(Protocol):
     A domain with chance in its steps takes a part of the key of `reset` into its state and splits
     it anew in every `step`: environments side by side, steps and episodes then all draw apart.
 
-    Optional functions, used where a domain has them: `shortest_steps(state)`, () int32, the fewest
+    Optional, used where a domain has them: `shortest_steps(state)`, () int32, the fewest
     steps that the team could still need; `sparse_states()`, the `states.SparseStates` that
     `state_table` lists, for large grids, whose table grows with the square of the cells;
     `critic_features(state)`, (N, F) float32, what a critic of its own is shown in training: what
     tells how each agent will fare, seen by anybody or not, in numbers that mean the same on any
     grid and in any team;
+    `largest_reward`, a constant, the size of the largest reward that a step has for an agent, where
+    a task does not pay in Predator-Prey's hundredths (`learning.rewards`);
+    `merit`, a constant, the figure that says how well a team does, "steps_taken" or "success" (see
+    `merit_of`); `figure_names`, F of them, and `measure(state, transition, following)`, (F, 2)
+    float32, figures of the domain's own (see `measured`);
     `reset_in_epoch(key, epoch)`, a fresh episode of an epoch of training, of a task that becomes
     harder while it is learnt (see `resets`).
     """
@@ -138,6 +144,28 @@ def resets(env: Environment, epoch: chex.Numeric) -> Callable[[chex.PRNGKey], An
     """
     changing = getattr(env, "reset_in_epoch", None)
     return env.reset if changing is None else partial(changing, epoch=epoch)
+
+
+def merit_of(env: Environment) -> str:
+    """The figure that says how well a team does on `env`: "steps_taken" until it is done, fewer
+    being better, or "success", where every episode lasts as long."""
+    return str(getattr(env, "merit", "steps_taken"))
+
+
+def figure_names(env: Environment) -> tuple[str, ...]:
+    """The figures that a domain has beside steps, success and return; none if it names none."""
+    return tuple(getattr(env, "figure_names", ()))
+
+
+def measured(env: Environment, state: Any, transition: Transition, following: Any) -> chex.Array:
+    """(F, 2) float32: what one step adds to each of `figure_names(env)`, an amount and a count.
+
+    Over steps and episodes both are added up, and the figure is all amounts over all counts: of
+    collisions per car, the cars that have collided in the step and those that came with it.
+    """
+    if not figure_names(env):
+        return jnp.zeros((0, 2))
+    return jnp.asarray(env.measure(state, transition, following), jnp.float32)  # type: ignore[attr-defined]
 
 
 def agents_leave(env: Environment) -> bool:

@@ -85,7 +85,8 @@ class Experiment:
       seeds: each trains its own policy in every stage.
       policy_settings: of a policy called by name, as {"hidden": 64}.
       name, preset: what the files call it.
-      threshold: steps taken that count as solved in the comparison.
+      threshold: steps taken, or whatever the target names as its merit, that count as solved in the
+        comparison.
       evaluate_every: epochs between held-out evaluations on the way, in every stage but the first
         of a chain; 0 for none.
       episodes: held-out episodes of an evaluation.

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from sumajax import reporting
-from sumajax.environments.types import Environment
+from sumajax.environments.types import Environment, figure_names
 from sumajax.evaluation import evaluate, evaluate_random, shortest_path_steps
 from sumajax.keys import key_of
 from sumajax.policies import Policy
@@ -39,12 +39,14 @@ def held_out(
         evaluate(env, policy, one, key, episodes=episodes, greedy=mode == "greedy")
         for one in params
     ]
-    means = [jax.tree.map(lambda x: float(x.mean()), result) for result in results]
+    own = [result.figures(env) for result in results]
     return evaluation_summary(
         episodes,
-        [mean.steps_taken for mean in means],
-        [mean.success for mean in means],
-        [mean.episode_return for mean in means],
+        *(
+            [float(getattr(result, name).mean()) for result in results]
+            for name in ("steps_taken", "success", "episode_return")
+        ),
+        **{name: [of_seed[name] for of_seed in own] for name in figure_names(env)},
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from sumajax import checkpoint, hosts, reporting
+from sumajax.environments.types import merit_of
 from sumajax.experiment import records
 from sumajax.experiment.directory import claimed
 from sumajax.experiment.interrupt import stop_when_asked
@@ -206,7 +207,8 @@ class Recorder:
         reporting.learning_curves(
             rows,
             self.directory / "curves.png",
-            bounds=_bounds(levels[experiment.target.name]),
+            y=merit_of(experiment.target.env),
+            bounds=_bounds(levels[experiment.target.name], merit_of(experiment.target.env)),
             labels=stage_labels(experiment),
             after={
                 stage.name: [before.name for before in experiment.ancestors(stage)]
@@ -354,7 +356,9 @@ def _mean(values: np.ndarray) -> float:
     return float(known.mean()) if known.size else float("nan")
 
 
-def _bounds(reference: dict[str, Any]) -> dict[str, float]:
+def _bounds(reference: dict[str, Any], merit: str) -> dict[str, float]:
+    if merit == "success":
+        return {"random policy": round(reference["random_success"], 3)}
     levels = {
         "random policy": reference["random_steps_taken"],
         "shortest paths": reference["shortest_path_steps"],

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sumajax.environments.types import Environment
+from sumajax.environments.types import Environment, figure_names, merit_of
 from sumajax.environments.wrapper import unwrapped
 from sumajax.experiment.plan import Experiment, Stage, described
 from sumajax.experiment.records import MODES, StageRecords
@@ -49,6 +49,7 @@ def summarise(
             rows,
             experiment.threshold,
             {role: stage.name for role, stage in roles.items() if stage and role != "source"},
+            merit_of(target.env),
         ),
         "zero_shot_greedy": zero_shot.get("greedy"),
         "references": references,
@@ -134,7 +135,16 @@ def _row(
         "seeds": f"{steps.min():.1f}-{steps.max():.1f}" if steps.size > 1 else None,
         "greedy": _steps(greedy),
         "cost": cost,
+        **{
+            name.replace("_", " "): figure_text(sampled[name]) if name in sampled else None
+            for name in figure_names(stage.env)
+        },
     }
+
+
+def figure_text(values: Any) -> str:
+    """Mean of a domain's own figure over the seeds."""
+    return f"{np.mean(values):.3f}"
 
 
 def _steps(evaluation: Mapping[str, Any]) -> str | None:

@@ -32,6 +32,8 @@ class LearnerConfig:
       gamma, gae_lambda: discount and trace decay of the advantage estimates.
       bootstrap_timeouts: value an episode cut by the step limit as if it went on.
       team_reward: share of the team's mean in each agent's return, 0 to 1.
+      scale_rewards: learn from rewards in units of the task's own, so that the largest that it says
+        a step has is 0.05, as in Predator-Prey (`rewards.reward_scale`).
       advantages: `raw`, `centred` to mean 0 over the batch, or `normalised` to standard deviation 1
         as well.
       mask_inactive: no policy gradient for actions that no longer change anything; what an agent
@@ -74,6 +76,7 @@ class LearnerConfig:
     gae_lambda: float = 0.95
     bootstrap_timeouts: bool = True
     team_reward: float = 0.2
+    scale_rewards: bool = True
     advantages: Advantages = "centred"
     mask_inactive: bool = True
     alive_mask: AliveMask = "before"
@@ -129,6 +132,7 @@ _PUBLISHED: dict[str, Any] = {
     "gae_lambda": 1.0,
     "bootstrap_timeouts": False,
     "team_reward": 0.0,
+    "scale_rewards": False,
     "advantages": "raw",
     "mask_inactive": False,
     "alive_mask": "after",
@@ -234,6 +238,7 @@ _NUMBERS: dict[str, tuple[Callable[[float], bool], str]] = {
 _SWITCHES = (
     "whole_episodes",
     "bootstrap_timeouts",
+    "scale_rewards",
     "mask_inactive",
     "scale_by_size",
     "clip_per_env",

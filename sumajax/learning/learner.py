@@ -19,6 +19,7 @@ from sumajax.learning.critic import CriticState
 from sumajax.learning.hetnet_loss import hetnet
 from sumajax.learning.losses import LossFunction, LossParts, actor_critic
 from sumajax.learning.optimiser import annealed, learning_rate, make_optimiser
+from sumajax.learning.rewards import reward_scale
 from sumajax.learning.rollout import (
     Actors,
     Draws,
@@ -121,7 +122,7 @@ class Metrics:
 
     @property
     def value_loss(self) -> chex.Array:
-        """() float32: squared error per agent and step."""
+        """() float32: squared error per agent and step, of rewards as they are learnt from."""
         return mean_of(self.sums.loss.value, self.sums.agent_steps)
 
     @property
@@ -279,6 +280,9 @@ class Learner:
         actors, trajectory = rollout(
             self.env, self.policy, params, actors, draws, config.detach_gap, self.unroll
         )
+        scale = reward_scale(self.env, config)
+        if scale != 1.0:
+            trajectory = replace(trajectory, reward=scale * trajectory.reward)
         last = last_value(self.env, self.policy, params, actors)
         if weights["critic"] is not None:
             trajectory, last = self._valued(weights["critic"], trajectory, actors)

@@ -194,16 +194,20 @@ def seed_curves(
     return np.array(epochs, int), values
 
 
+REACHES: dict[str, Any] = {"steps_taken": np.less_equal, "success": np.greater_equal}
+"""When a figure of merit has come to a threshold; NaN never has."""
+
+
 def env_steps_to_threshold(
-    rows: Iterable[Mapping[str, Any]], arm: str, threshold: float
+    rows: Iterable[Mapping[str, Any]], arm: str, threshold: float, merit: str = "steps_taken"
 ) -> list[int | None]:
     """Per seed, the arm's own environment steps when an epoch's mean steps taken first came to
-    `threshold` or below; None where it never did."""
-    _, values = seed_curves(rows, arm, "env_steps", "steps_taken")
-    below = values["steps_taken"] <= threshold  # NaN compares false
+    `threshold` or below, or with `merit` its success to that or above; None where it never did."""
+    _, values = seed_curves(rows, arm, "env_steps", merit)
+    reached = REACHES[merit](values[merit], threshold)
     return [
         int(env_steps[hit.argmax()]) if hit.any() else None
-        for env_steps, hit in zip(values["env_steps"], below, strict=True)
+        for env_steps, hit in zip(values["env_steps"], reached, strict=True)
     ]
 
 
@@ -230,12 +234,16 @@ TRANSFERRED = {"transfer": "transfer", "scratch": "scratch"}
 
 
 def comparison(
-    rows: Iterable[Mapping[str, Any]], threshold: float, arms: Mapping[str, str] = TRANSFERRED
+    rows: Iterable[Mapping[str, Any]],
+    threshold: float,
+    arms: Mapping[str, str] = TRANSFERRED,
+    merit: str = "steps_taken",
 ) -> dict[str, Any]:
     """The `comparison` entry of summary.json, from the rows of metrics.csv.
 
     Args:
       arms: which arm is the `transfer` and which the `scratch`; either may be missing.
+      merit: what the threshold is of; the entry names it where it is not steps taken.
     """
     rows = list(rows)
     named = [arms.get(role, "") for role in ("scratch", "transfer")]
@@ -243,9 +251,10 @@ def comparison(
         "steps_taken_ratio": steps_taken_ratio(rows, *named),
         "threshold": threshold,
         "env_steps_to_threshold": {
-            role: env_steps_to_threshold(rows, arms.get(role, ""), threshold)
+            role: env_steps_to_threshold(rows, arms.get(role, ""), threshold, merit)
             for role in ("transfer", "scratch")
         },
+        **({} if merit == "steps_taken" else {"merit": merit}),
     }
 
 
@@ -269,15 +278,24 @@ def arm_summary(
     }
 
 
+EVAL = ("episodes", "steps_taken", "success", "return")
+"""What every evaluation of summary.json has; whatever else it has is of the domain's own."""
+
+
 def evaluation_summary(
-    episodes: int, steps_taken: Any, success: Any, returns: Any
+    episodes: int, steps_taken: Any, success: Any, returns: Any, **figures: Any
 ) -> dict[str, Any]:
-    """One evaluation of summary.json: means over `episodes` starts, (S,) each, one per seed."""
+    """One evaluation of summary.json: means over `episodes` starts, (S,) each, one per seed.
+
+    Args:
+      figures: the domain's own, by name, (S,) each.
+    """
     return {
         "episodes": int(episodes),
         "steps_taken": np.atleast_1d(steps_taken).tolist(),
         "success": np.atleast_1d(success).tolist(),
         "return": np.atleast_1d(returns).tolist(),
+        **{name: np.atleast_1d(values).tolist() for name, values in figures.items()},
     }
 
 

@@ -162,9 +162,27 @@ OUTPUTS = {
 }
 """A directory of `outputs`."""
 
+JUNCTIONS = {
+    "--target.size 12": "target size 12x12 is not a whole multiple of the source size 7x7",
+    "--target.size 13": "size 13 of the medium junction must be even and at least 5",
+    "--target.difficulty hard": "size 14 of the hard junction must be a multiple of 3, at least 9",
+    "--source.difficulty huge": "invalid choice 'huge' for argument '--source.difficulty'",
+    "--difficulties easy huge": "invalid choice 'huge' for argument '--difficulties'. Expected one",
+    "--difficulties easy medium --sizes 7": "difficulties has 2 values and sizes 1; give as many",
+    "--difficulties hard hard --sizes 9 18 --teams 5": "teams has 1 values and sizes 2; give as",
+    "--difficulties easy hard hard --sizes 9 18 18": "sizes and teams say one stage twice: 9x9-5,",
+    "--difficulties hard hard --sizes 9 10": "size 10 of the hard junction must be a multiple of 3",
+    "--sizes 7x14 14": "a junction has equal sides, got 7x14; give one number.",
+    "--source.num-cars 1": "source: num_cars must be at least 2, got 1.",
+    "--source.arrival-rate 2": "source: arrival_rate is a chance between 0 and 1, got 2.0.",
+    "--policy hetnet": "hetnet has no message for an agent that is not there, and agents of this",
+    "--threshold 0": "threshold must be a number greater than 0, got 0.0.",
+}
+
 BAD: list[tuple[str, str, str]] = [
     *(("pp", options, sentence) for options, sentence in TASKS.items()),
     *(("pcp", options, sentence) for options, sentence in CAPTURE_TASKS.items()),
+    *(("tj", options, sentence) for options, sentence in JUNCTIONS.items()),
     *(("pp", options, sentence) for options, sentence in RUNS.items()),
     *(("pp", f"--learner.{options}", sentence) for options, sentence in LEARNER.items()),
     *(("pp", f"--source-checkpoint @{name}", words) for name, words in SOURCES.items()),
@@ -333,7 +351,7 @@ def test_no_command_is_refused_with_those_there_are(arguments, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(arguments)
     assert stop.value.code == 2
-    assert "sumajax transfer pp|pcp" in capsys.readouterr().err
+    assert "sumajax transfer pp|pcp|tj" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("home", ["none", "unwritable"])

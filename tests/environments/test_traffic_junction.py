@@ -331,6 +331,29 @@ def test_who_has_come_is_part_of_what_is_seen():
     assert seen == [[], [0], [2], [], [], [], [], [], [0], []]
 
 
+def test_figures_of_merit():
+    """Collisions per car, mean delay and cars through, as amounts and counts of each step."""
+    brakes = [BRAKE, GAS, GAS]
+    states, transitions = play(
+        EASY,
+        [
+            (GO, [(0, 0, 0)]),  # one comes
+            (brakes, [(0, 1, 0)]),  # it waits, and another comes into it
+            (brakes, []),  # waits again; the other goes on
+            *[(GO, [])] * 6,  # of seven cells the other has one more to go
+            (GO, [(0, 1, 0)]),  # both are out but one; a third comes
+        ],
+    )
+    steps = zip(states, transitions, states[1:], strict=False)
+    measured = np.array([EASY.measure(*step) for step in steps])
+    collisions, delay, through = np.moveaxis(measured, 1, 0)
+    assert collisions.tolist() == [[0, 1], [2, 1], *[[0, 0]] * 7, [0, 1]]
+    assert delay[:, 0].tolist() == [0, 1, 1, *[0] * 7]
+    assert (delay[:, 1] == collisions[:, 1]).all()
+    assert through[:, 0].sum() == sum(int(t.left.sum()) for t in transitions) == 2
+    assert not through[:, 1].any()  # no episode has ended
+
+
 class TestCurriculum:
     def test_a_rate_stays_unless_it_is_to_rise(self):
         for last in (None, 0.1, 0.05):
@@ -347,7 +370,6 @@ class TestCurriculum:
     def test_an_epoch_counts_once(self):
         env = TrafficJunction(arrival_rate=0.1, final_arrival_rate=0.2, rate_epochs=(2, 6))
         np.testing.assert_allclose(env.rates([2, 2, 3, 1]), [0.12, 0.12, 0.14, 0.14])
-
 
     def test_an_episode_is_at_the_last_rate_or_at_that_of_its_epoch(self):
         env = TrafficJunction(arrival_rate=0.1, final_arrival_rate=0.2, rate_epochs=(2, 6))

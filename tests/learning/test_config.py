@@ -29,6 +29,7 @@ PUBLISHED = {
     "learning_rate": 1e-3,
     "transfer_rate": 1.0,
     "scale_by_size": False,
+    "scale_rewards": False,
     "critic_epochs": 0,
     "max_grad_norm": None,
     "clip_per_env": False,

@@ -190,9 +190,26 @@ def test_the_comparison_is_that_of_target_steps_alone():
         "scratch": [200_000, None],
     }
     assert found["steps_taken_ratio"] == pytest.approx(2.0)  # at epoch 6, the last of both
+    assert "merit" not in found
     alone = metrics.comparison(chunk("transfer", 1, 6), threshold=1.0)
     assert alone["steps_taken_ratio"] is None
     assert alone["env_steps_to_threshold"] == {"transfer": [None, None], "scratch": []}
+
+
+def test_a_comparison_by_success_says_so():
+    """Where all episodes last as long: solved is what has come to the threshold or beyond."""
+    rows = [{**row, "success": 0.1 * row["epoch"]} for row in chunk("transfer", 1, 6)]
+    found = metrics.comparison(rows, threshold=0.35, merit="success")
+    assert found["merit"] == "success"
+    assert found["env_steps_to_threshold"] == {"transfer": [80_000, 80_000], "scratch": []}
+    never = metrics.comparison(rows, threshold=0.8, merit="success")
+    assert never["env_steps_to_threshold"]["transfer"] == [None, None]
+
+
+def test_an_evaluation_may_have_figures_of_the_domains_own():
+    shown = metrics.evaluation_summary(8, [3.0], [1.0], [-1.0], mean_delay=[0.25])
+    assert tuple(shown) == (*metrics.EVAL, "mean_delay")
+    assert shown["mean_delay"] == [0.25]
 
 
 def test_an_arm_of_summary_json_has_the_agreed_form(tmp_path):
