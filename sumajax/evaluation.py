@@ -1,6 +1,7 @@
 """Held-out episodes, sampled and greedy; a random policy and the shortest paths beside them."""
 
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from sumajax import checkpoint
 from sumajax.checkpoint import CheckpointError
 from sumajax.description import rebuild_policy, rebuild_task
 from sumajax.environments.types import Environment, Observation
+from sumajax.export import PLATFORMS, export_policy
 from sumajax.keys import key_of
 from sumajax.learning.rollout import Actors, act, hand_on, presence_in, select, state_features
 from sumajax.policies.types import Policy
@@ -199,6 +201,15 @@ class Agent:
         noise = self.policy.sample_noise(key, obs.view.shape[:-4], greedy)
         carry, output = self.policy.apply_with(self.params, carry, obs, noise)
         return carry, output.action
+
+    def export(
+        self, directory: str | os.PathLike[str], *, platforms: Sequence[str] = PLATFORMS
+    ) -> Path:
+        """Writes the step, with the parameters in it, for programs that have JAX alone.
+
+        Arguments, errors and the files as for `sumajax.export.export_policy`.
+        """
+        return export_policy(self.env, self.policy, self.params, directory, platforms=platforms)
 
 
 def load_agent(
