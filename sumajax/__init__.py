@@ -2,7 +2,7 @@
 
 from sumajax.checkpoint import load, load_npz, save, save_npz
 from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
-from sumajax.evaluation import evaluate, load_agent
+from sumajax.evaluation import evaluate, load_agent, pretrained
 from sumajax.learning import LearnerConfig, make_learner, preset
 from sumajax.policies import make_policy
 from sumajax.upsampling import StateUpsampled, upsample
@@ -22,6 +22,7 @@ __all__ = [
     "make_learner",
     "make_policy",
     "preset",
+    "pretrained",
     "save",
     "save_npz",
     "upsample",
