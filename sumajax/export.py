@@ -44,6 +44,7 @@ _MEANING = {
     "view": "counts of the entities in the cells around each agent, a channel for each kind; -1 "
     "outside the grid",
     "alive": "which agents are in the task now",
+    "entered": "which agents have come with the last step: they start without memory",
     "key": f"two words of a {IMPLEMENTATION} key, as jax.random.key_data(jax.random.key(0)); a new "
     "one for every step; not used where greedy",
     "greedy": "true: every choice is the likeliest; false: drawn from the policy's probabilities",
@@ -148,6 +149,8 @@ def _inputs(policy: Policy) -> tuple[Any, ...]:
     }
     if team.agents_leave:
         shapes["alive"] = jax.ShapeDtypeStruct((team.num_agents,), jnp.bool_)
+    if team.agents_leave and policy.fresh_memory:
+        shapes["entered"] = shapes["alive"]
     key = jax.eval_shape(lambda: jax.random.key_data(key_of(0)))
     return _carried(policy), shapes, key, jax.ShapeDtypeStruct((), jnp.bool_)
 

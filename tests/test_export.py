@@ -141,21 +141,25 @@ def test_the_card_lists_every_input_and_output(tmp_path):
         }
 
 
-def test_a_team_that_comes_and_goes_is_told_who_is_there(tmp_path):
+@pytest.mark.parametrize("fresh_memory", [False, True])
+def test_a_team_that_comes_and_goes_is_told_who_is_there(fresh_memory, tmp_path):
     env = TrafficJunction(num_cars=3)
-    agent = agent_of("ic3net", env, hidden=4)
+    agent = agent_of("ic3net", env, hidden=4, fresh_memory=fresh_memory)
     card = json.loads((agent.export(tmp_path / "team") / "card.json").read_text())
+    more = {"alive", "entered"} if fresh_memory else {"alive"}
+    assert set(card["inputs"]["observation"]) == {"state", "view"} | more
     assert card["inputs"]["observation"]["alive"]["shape"] == ["b", env.num_agents]
     obs = jax.tree.map(lambda x: x[None], env.observe(env.reset(key_of(1))))
     step = export.deserialize((tmp_path / "team" / "step.bin").read_bytes()).call
-    carry = {"h": 0.0, "s": 0.0, "gate": 0.0}
-    with np.load(tmp_path / "team" / "carry.npz") as first:
-        carry = {name: first[name][None] for name in carry}
-    seen = {"state": obs.state, "view": obs.view, "alive": obs.alive}
-    key = jax.random.key(3)
-    _, output = step(carry, seen, jax.random.key_data(key), np.bool_(False))
-    _, action = agent.act(agent.initial_carry((1,)), obs, key)
-    np.testing.assert_array_equal(output["action"], action)
+    first = agent.initial_carry((1,))
+    carry = {"h": first.h + 1, "s": first.s + 1, "gate": first.gate}
+    seen = {"state": obs.state, "view": obs.view, "alive": obs.alive, "entered": obs.alive}
+    seen = {name: seen[name] for name in card["inputs"]["observation"]}
+    obs, key = obs.replace(entered=obs.alive), jax.random.key(3)
+    after, _ = step(carry, seen, jax.random.key_data(key), np.bool_(False))
+    expected, _ = agent.act(first.replace(h=carry["h"], s=carry["s"]), obs, key)
+    for name in carry:
+        np.testing.assert_allclose(after[name], getattr(expected, name), rtol=1e-4, atol=1e-6)
 
 
 class TestRefusals:
