@@ -41,6 +41,9 @@ run's own evaluations is another again."""
 CHECK_EPISODES = 64
 """Held-out episodes whose steps the card lists one by one: what the tests play again."""
 LICENCE = "MIT"
+PAGE = Path(__file__).parents[1] / "docs" / "pretrained.md"
+TABLE = "<!-- python -m experiments.pretrained writes the table -->"
+END = "<!-- end of the table -->"
 PRIVATE = ("--output",)
 """Options that say where a run was written, and nothing of what it was."""
 
@@ -188,6 +191,36 @@ def meta_of(directory: Path, agent: Agent, seed: int) -> dict[str, Any]:
     return {**meta, "seeds": [seed], "untrained": untrained}
 
 
+def table() -> str:
+    """The store's policies for docs/pretrained.md, a row each."""
+    columns = "name", "task", "sampled", "success", "greedy", "success", "shortest paths", "seed"
+    rows = [columns, ("---",) * len(columns), *map(_row, store.names())]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _row(name: str) -> tuple[str, ...]:
+    card = store.card(name)
+    figures = [
+        text
+        for mode in MODES
+        for text in (
+            f"{card['held_out'][mode]['steps_taken']:.2f}",
+            f"{card['held_out'][mode]['success']:.3f}",
+        )
+    ]
+    bound = card["held_out"]["shortest_path_steps"]
+    seed = f"{card['seed']} of {', '.join(map(str, card['seeds_tried']))}"
+    shortest = "-" if bound is None else f"{bound:.2f}"
+    return f"`{name}`", card["task"], *figures, shortest, seed
+
+
+def write_table(page: Path = PAGE) -> None:
+    """Renews the table of the page."""
+    before, _, rest = page.read_text().partition(TABLE)
+    _, _, after = rest.partition(END)
+    page.write_text(f"{before}{TABLE}\n\n{table()}\n{END}{after}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", help="directories of finished runs")
@@ -197,6 +230,7 @@ def main() -> None:
     for run in chosen.runs:
         for name in entries_of(run, chosen.commit, chosen.arms):
             print(name, json.dumps(store.card(name)["held_out"]))
+    write_table()
     total = sum(file.stat().st_size for file in store.FOLDER.iterdir())
     print(f"the store has {len(store.names())} policies, {total} bytes")
 

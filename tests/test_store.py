@@ -11,10 +11,14 @@ import sumajax
 from experiments.pretrained import (
     CARD_SEED,
     CHECK_EPISODES,
+    END,
     LICENCE,
     MODES,
+    PAGE,
+    TABLE,
     name_of,
     steps_of_each,
+    table,
 )
 from sumajax import PredatorPrey, StateUpsampled, checkpoint, load_agent, make_policy, store
 from sumajax.experiment.plan import Experiment, Stage, described
@@ -88,6 +92,10 @@ def test_a_card_says_what_has_to_be_known(name):
         assert figures["success"] > 0.9
         few = np.mean(card["check"][mode])
         assert abs(few - figures["steps_taken"]) < 0.5 * figures["steps_taken"]
+
+
+def test_the_page_has_the_figures_of_the_cards():
+    assert f"{TABLE}\n\n{table()}\n{END}" in PAGE.read_text()
 
 
 def test_all_together_they_are_small():
