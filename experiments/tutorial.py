@@ -167,7 +167,24 @@ write_gif(episode, OUTPUT / "replay.gif")
 write_strip(episode, OUTPUT / "replay.png")
 print(f"an episode of {episode.num_steps} steps is in {OUTPUT / 'replay.gif'}")
 
+
+class Picture:
+    """A file that a notebook shows below the cell."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def _repr_png_(self) -> bytes:
+        return self.file.read_bytes()
+
+
 # an episode of 21 steps is in runs/tutorial-20261126-130638/replay.gif
+
+# %%
+Picture(OUTPUT / "curves.png")
+
+# %%
+Picture(OUTPUT / "replay.png")
 
 # %% [markdown]
 # ## 7. Let it act in a program of your own

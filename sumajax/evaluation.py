@@ -1,6 +1,7 @@
 """Held-out episodes, sampled and greedy; a random policy and the shortest paths beside them."""
 
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from sumajax import checkpoint
+from sumajax import checkpoint, store
 from sumajax.checkpoint import CheckpointError
 from sumajax.description import rebuild_policy, rebuild_task
 from sumajax.environments.types import Environment, Observation, figure_names, measured
+from sumajax.export import PLATFORMS, export_policy
 from sumajax.keys import key_of
 from sumajax.learning.rollout import Actors, act, hand_on, presence_in, select, state_features
 from sumajax.policies.types import Policy
 from sumajax.records import exportable
-from sumajax.transfer import checkpoints_of
+from sumajax.sources import source_of
 
 HELD_OUT_SEED = 20_240_229
 """Of the held-out starts; training keys are folded from small seeds, never from this."""
@@ -217,6 +219,15 @@ class Agent:
         carry, output = self.policy.apply_with(self.params, carry, obs, noise)
         return carry, output.action
 
+    def export(
+        self, directory: str | os.PathLike[str], *, platforms: Sequence[str] = PLATFORMS
+    ) -> Path:
+        """Writes the step, with the parameters in it, for programs that have JAX alone.
+
+        Arguments, errors and the files as for `sumajax.export.export_policy`.
+        """
+        return export_policy(self.env, self.policy, self.params, directory, platforms=platforms)
+
 
 def load_agent(
     directory: str | os.PathLike[str],
@@ -229,7 +240,8 @@ def load_agent(
 
     Args:
       directory: of a run (the policy of its last stage is taken), of one of its
-        checkpoints/<stage>, or of one checkpoint.
+        checkpoints/<stage>, or of one checkpoint; or the name of a policy of the package, as for
+        `pretrained`.
       seed: which of the seeds that were trained side by side; None: the first.
       env, policy: what it was trained on and as, where the package does not know them.
 
@@ -237,27 +249,40 @@ def load_agent(
       CheckpointError: when there is no good checkpoint, it has not that seed, or it is of a task or
         policy that the package does not know, or of another than was given.
     """
-    root = checkpoints_of(Path(directory))
-    meta = checkpoint.read_meta(root)
+    found = source_of(directory)
+    meta = found.meta
     if env is None and policy is None:
         env, policy = checkpoint.rebuild(meta)
     else:
         env, policy = _given(meta, env, policy)
-        checkpoint.check_compatible(meta, env, policy, root)
+        checkpoint.check_compatible(meta, env, policy, found.name)
     like = jax.eval_shape(policy.init, key_of(0))
     seeds = meta.get("seeds", [])
     if seed is not None and seed not in (seeds or [0]):
         known = ", ".join(map(str, seeds or [0]))
-        raise CheckpointError(f"{root} has no seed {seed}; its seeds are {known}.")
+        raise CheckpointError(f"{found.name} has no seed {seed}; its seeds are {known}.")
     if seeds:
         place = 0 if seed is None else seeds.index(seed)
         stacked = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((len(seeds), *x.shape), x.dtype), like
         )
-        params = jax.tree.map(lambda x: x[place], checkpoint.load_params(root, stacked))
+        params = jax.tree.map(lambda x: x[place], found.load(stacked))
     else:
-        params = checkpoint.load_params(root, like)
+        params = found.load(like)
     return Agent(env, policy, jax.tree.map(jnp.asarray, params))
+
+
+def pretrained(name: str) -> Agent:
+    """A trained policy of the package, as `pretrained("pp-10x10-ic3net")`.
+
+    `sumajax.store.names()` lists them; `sumajax.store.card(name)` says how one was made and what
+    it reaches.
+
+    Raises:
+      ValueError: for an unknown name; lists the known.
+    """
+    store.entry(name)
+    return load_agent(name)
 
 
 def _given(

@@ -22,6 +22,7 @@ from sumajax.checkpoint import CheckpointError
 from sumajax.learning import parallel
 from sumajax.learning.guard import FAULTS
 from sumajax.learning.learner import Learner, Metrics, TrainState
+from sumajax.sources import source_of
 
 CHUNK = 5
 """Epochs of a compiled call: between two looks at the metrics, and between two checkpoints."""
@@ -86,29 +87,6 @@ class Chunk:
     cpu_seconds: float = 0.0  # user and system time of the process since the stage began
 
 
-def stage_directories(run: Path) -> dict[str, Path]:
-    """Where the checkpoints of each stage of a run lie, by its name; the stage that comes after
-    most others, the run's target where it has been reached, stands first.
-
-    Empty for what is no directory of a run.
-    """
-    folder = run / "checkpoints"
-    names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
-    found = {name: folder / name for name in names if checkpoint.latest(folder / name) is not None}
-    follows = {name: _follows(checkpoint.read_meta(path)) for name, path in found.items()}
-    return {name: found[name] for name in sorted(found, key=lambda name: -len(follows[name]))}
-
-
-def _follows(meta: dict[str, Any]) -> list[str]:
-    """The stages that a stage comes from; before they were recorded only `transfer` had one."""
-    return meta.get("follows", ["source"] if meta.get("arm") == "transfer" else [])
-
-
-def checkpoints_of(directory: Path) -> Path:
-    """`directory`, or of a run the one of its last stage's checkpoints."""
-    return next(iter(stage_directories(directory).values()), directory)
-
-
 def fresh_states(stage: StageRun) -> TrainState:
     """Untrained states, stacked over the stage's seeds."""
     return parallel.init_seeds(stage.learner, list(stage.seeds))
@@ -128,7 +106,8 @@ def transferred_states(
     one.
 
     Args:
-      source: of the stage's checkpoints, or of a run, whose last stage is meant.
+      source: of the stage's checkpoints, or of a run, whose last stage is meant; or the name of a
+        trained policy of the package.
       leave_out: modules of the policy whose parameters stay fresh, as `state_encoder`.
 
     Raises:
@@ -169,24 +148,22 @@ def saved_parts(stage: StageRun, source: Path, *, carry_optimiser: bool = False)
       CheckpointError: when there is no good checkpoint, or it does not fit: the sentence names the
         setting or the leaf and both values.
     """
-    source = checkpoints_of(source)
-    learner, meta = stage.learner, checkpoint.read_meta(source)
-    checkpoint.check_compatible(meta, learner.env, learner.policy, source)
+    found, learner = source_of(source), stage.learner
+    meta = found.meta
+    checkpoint.check_compatible(meta, learner.env, learner.policy, found.name)
     saved_seeds = meta.get("seeds", [0])
     by_number = set(stage.seeds) <= set(saved_seeds)
     if not by_number and len(saved_seeds) != 1:
         raise CheckpointError(
-            f"{source} holds seeds {saved_seeds}, this stage has {list(stage.seeds)}; give seeds "
-            "that it holds, or checkpoints of one seed."
+            f"{found.name} holds seeds {saved_seeds}, this stage has {list(stage.seeds)}; give "
+            "seeds that it holds, or checkpoints of one seed."
         )
     like = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((len(saved_seeds), *x.shape[1:]), x.dtype),
         jax.eval_shape(lambda: fresh_states(stage)),
     )
     fields = ("params", "opt_state") if carry_optimiser else ("params",)
-    saved = {
-        field: checkpoint.load_params(source, getattr(like, field), field=field) for field in fields
-    }
+    saved = {field: found.load(getattr(like, field), field) for field in fields}
     if not by_number:
         return saved
     places = np.array([saved_seeds.index(seed) for seed in stage.seeds])
@@ -207,7 +184,10 @@ def untrained_parameters(
       params: what was transferred from `source`, leaves (seeds, ...).
       seeds: whose they are, where they may be some of the source's.
     """
-    saved_seeds = checkpoint.read_meta(checkpoints_of(source)).get("seeds", [0])
+    meta = source_of(source).meta
+    if "untrained" in meta:
+        return list(meta["untrained"])
+    saved_seeds = meta.get("seeds", [0])
     by_number = set(seeds) <= set(saved_seeds)
     drawn = parallel.init_seeds(learner, list(seeds if by_number else saved_seeds)).params
     pairs = zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(drawn), strict=True)

@@ -1,7 +1,6 @@
 """The pages in docs/: their code runs, in the order it stands, and their links lead somewhere."""
 
 import json
-import os
 import re
 import runpy
 import shlex
@@ -10,6 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
+
+from sumajax.cli import main, transfer
+from sumajax.reporting.loggers import FIGURES
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -41,6 +44,37 @@ def test_extending(capsys, tmp_path, monkeypatch):
     assert capsys.readouterr().out.count("steps taken") == 2
     assert shared["summary"]["transfer"]["env_steps"] == 40_000
     assert shared["agent"].env == shared["Line"](12, max_steps=24)
+
+
+def test_sweeps(monkeypatch, tmp_path):
+    """The trial that W&B would start: every parameter is an option of the command."""
+    monkeypatch.chdir(tmp_path)
+    (sweep,) = re.findall(r"```yaml\n(.*?)```", (DOCS / "sweeps.md").read_text(), re.DOTALL)
+    sweep = yaml.safe_load(sweep)
+    assert sweep["command"][:2] == ["bash", "-c"]
+    command = shlex.split(sweep["command"][2])
+    trial = {
+        name: values.get("values", [values.get("min")])[-1]
+        for name, values in sweep["parameters"].items()
+    }
+    given = [f"--{name}={value}" for name, value in trial.items()]
+    planned = {}
+    monkeypatch.setattr(
+        transfer,
+        "run_experiment",
+        lambda *plan: planned.update(zip(("plan", "directory", "where"), plan, strict=True)) or {},
+    )
+    assert command[-1] == "$@"
+    main([*command[1:-1], *given])
+    plan, where = planned["plan"], planned["where"]
+    assert plan.policy == trial["policy"]
+    learner = plan.stages[0].learner
+    assert learner.learning_rate == trial["learner.learning-rate"]
+    assert learner.entropy_weight == trial["learner.entropy-weight"]
+    assert where.log == ("wandb",)
+    stage, _, column = sweep["metric"]["name"].split("/")
+    assert stage in [stage.name for stage in plan.stages]
+    assert column in FIGURES
 
 
 def test_jaxmarl(capsys):
@@ -98,19 +132,16 @@ def png_size(file: Path) -> bytes:
 
 @pytest.mark.slow
 def test_the_tutorial_as_a_notebook(tmp_path):
-    """Made and executed by the commands of docs/tutorial.md."""
+    """Made and executed by the command of docs/tutorial.md, as CI does for the site."""
     for tool in ("jupytext", "nbconvert", "ipykernel"):
         pytest.importorskip(tool, reason="needs the extra docs")
-    (tmp_path / "experiments").symlink_to(ROOT / "experiments")
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    commands = re.findall(r"^(?:jupytext|jupyter) .*$", (DOCS / "tutorial.md").read_text(), re.M)
-    assert len(commands) == 2
-    for command in commands:
-        subprocess.run(
-            shlex.split(command), cwd=tmp_path, env=os.environ | {"PATH": path}, check=True
-        )
+    (tmp_path / "docs").symlink_to(DOCS)
+    (command,) = re.findall(r"^python docs.*$", (DOCS / "tutorial.md").read_text(), re.M)
+    words = [sys.executable, *shlex.split(command)[1:]]
+    subprocess.run(words, cwd=tmp_path, check=True)
     cells = json.loads((tmp_path / "tutorial.ipynb").read_text())["cells"]
     outputs = [output for cell in cells for output in cell.get("outputs", ())]
     printed = "".join("".join(output.get("text", ())) for output in outputs)
     assert "actions of 8 teams of 5: (8, 5)" in printed
+    assert sum("image/png" in output.get("data", ()) for output in outputs) == 2
     assert (next((tmp_path / "runs").glob("tutorial-*")) / "replay.gif").exists()

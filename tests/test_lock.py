@@ -21,7 +21,9 @@ def locked():
 def required():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    lines = [*project["dependencies"], *extras["experiments"], *extras["dev"]]
+    lines = [*project["dependencies"]]
+    for extra in ("experiments", "export", "dev", "docs"):
+        lines += extras[extra]
     return [needed for needed in map(Requirement, lines) if needed.name != "sumajax"]
 
 

@@ -22,11 +22,13 @@ silently saves nothing until the step of the damaged one is passed; and it does 
 the disk itself (fsync). tests/checkpoint/test_orbax_checkpointer.py shows the first three.
 
 `format` says what is on disk, `leaves` how a state has names, `files` what is verified, `directory`
-which checkpoints there are, `writing` and `reading` do it, `orbax` is all that knows Orbax.
+which checkpoints there are, `writing` and `reading` do it, `orbax` is all that knows Orbax. `npz`
+stands beside them: parameters alone, as one plain file of NumPy's.
 """
 
 from sumajax.checkpoint.directory import remove_unfinished
 from sumajax.checkpoint.format import DESCRIPTION, MAX_DESCRIPTION_BYTES, MAX_STATE_BYTES
+from sumajax.checkpoint.npz import load_npz, save_npz
 from sumajax.checkpoint.reading import identity, latest, load, load_params, read_meta
 from sumajax.checkpoint.writing import check_directory, save
 from sumajax.description import CheckpointError, check_compatible, describe, rebuild
@@ -42,9 +44,11 @@ __all__ = [
     "identity",
     "latest",
     "load",
+    "load_npz",
     "load_params",
     "read_meta",
     "rebuild",
     "remove_unfinished",
     "save",
+    "save_npz",
 ]

@@ -11,6 +11,8 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from sumajax import store
+
 MAX_BYTES = 2**20
 NOTE = (
     "--config FILE takes the options from the config.json of a run (all but where it was written); "
@@ -41,7 +43,9 @@ def with_config_file(experiment: type, arguments: list[str]) -> list[str]:
 
 def _beside(file: Path, path: str) -> str:
     """A relative path in a file is one beside it; files of earlier versions meant the working
-    directory."""
+    directory. The name of a policy of the package is no path."""
+    if store.is_named(path):
+        return path
     beside = file.parent / path
     return str(beside if beside.exists() or not Path(path).exists() else path)
 

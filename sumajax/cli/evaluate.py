@@ -4,6 +4,7 @@ sumajax evaluate runs/pp_transfer-ic3net-fast
 sumajax evaluate runs/pp_transfer-ic3net-fast --sizes 5 10 --teams 3 5 8
 sumajax evaluate runs/pcp_transfer-hetnet-fast --teams 3+2 --json all.json
 sumajax evaluate runs/mine/checkpoints/transfer --modes greedy --replay best.gif
+sumajax evaluate pp-10x10-hetnet --replay r.gif
 """
 
 import sys
@@ -15,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from sumajax import checkpoint, reporting
+from sumajax import checkpoint, reporting, store
 from sumajax.checkpoint import CheckpointError
 from sumajax.cli.domains import (
     DOMAINS,
@@ -36,7 +37,7 @@ from sumajax.keys import key_of
 from sumajax.learning import parallel
 from sumajax.policies import Policy
 from sumajax.reporting.metrics import EVAL
-from sumajax.transfer import stage_directories
+from sumajax.sources import source_of, stage_directories
 from sumajax.upsampling import StateUpsampled
 
 Mode = Literal["sampled", "greedy"]
@@ -48,7 +49,8 @@ class EvaluateConfig:
     """Plays trained policies on held-out starts: every policy on every grid with every team."""
 
     path: tyro.conf.Positional[Path]
-    """Directory of a run (all its policies), of one of its checkpoints/<arm>, or one checkpoint."""
+    """Directory of a run (all its policies), of one of its checkpoints/<arm>, or one checkpoint; or
+    the name of a trained policy of the package, as pp-10x10-hetnet."""
     sizes: tuple[str, ...] = ()
     """Grids, as 10 or 10x20, that divide the policy's own; those it was trained on if not given."""
     teams: tuple[str, ...] = ()
@@ -108,8 +110,11 @@ def load(config: EvaluateConfig) -> list[Trained]:
       CheckpointError: when there is none, or one is damaged or lacks a seed; ValueError: for an arm
         the run does not have.
     """
-    if not config.path.is_dir():
-        raise CheckpointError(f"{config.path} is no directory of a run or of checkpoints.")
+    if not config.path.is_dir() and not store.is_named(config.path):
+        raise CheckpointError(
+            f"{config.path} is no directory of a run or of checkpoints, nor the name of a trained "
+            f"policy of the package; it has {', '.join(store.names())}."
+        )
     found = stage_directories(config.path)
     if not found:
         if config.arms:
@@ -125,17 +130,18 @@ def load(config: EvaluateConfig) -> list[Trained]:
     ]
 
 
-def _trained(directory: Path, arm: str | None, seeds: tuple[int, ...]) -> Trained:
-    meta = checkpoint.read_meta(directory)
+def _trained(place: Path, arm: str | None, seeds: tuple[int, ...]) -> Trained:
+    source = source_of(place)
+    meta = source.meta
     saved = tuple(meta.get("seeds", (0,)))
     for seed in seeds:
         if seed not in saved:
-            raise CheckpointError(f"{directory} holds seeds {list(saved)}, not {seed}.")
+            raise CheckpointError(f"{source.name} holds seeds {list(saved)}, not {seed}.")
     seeds = seeds or saved
-    agents = tuple(load_agent(directory, seed=seed) for seed in seeds)
+    agents = tuple(load_agent(place, seed=seed) for seed in seeds)
     env: Any = agents[0].env
     task: Any = unwrapped(env)
-    name = arm or str(meta.get("arm", directory.name))
+    name = arm or (place.name if store.is_named(place) else str(meta.get("arm", place.name)))
     return Trained(name, meta, task, env.state_shape[1:], seeds, agents)
 
 

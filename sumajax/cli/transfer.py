@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from sumajax import hosts
+from sumajax import hosts, store
 from sumajax.cli.config_file import NOTE, with_config_file
 from sumajax.cli.domains import (
     DOMAINS,
@@ -81,8 +81,8 @@ class TransferOptions:
     scratch_epochs: int | None = None
     """Epochs from scratch; the target's if not given."""
     source_checkpoint: Path | None = None
-    """Checkpoints, or a run, to transfer from, made elsewhere; the source stage is then left
-    out."""
+    """Checkpoints, or a run, to transfer from, made elsewhere, or the name of a trained policy of
+    the package, as pp-5x5-at-10x10-ic3net; the source stage is then left out."""
     output: Path | None = None
     """Directory of the run; runs/<experiment>-<policy>-<preset> if not given."""
     scale: Scale = "none"
@@ -342,7 +342,8 @@ def described(options: TransferOptions) -> dict[str, Any]:
     """The options as config.json keeps them, without those of one host's place in the run."""
     values = asdict(options)
     if options.source_checkpoint is not None:
-        values["source_checkpoint"] = options.source_checkpoint.absolute()
+        place = options.source_checkpoint
+        values["source_checkpoint"] = place if store.is_named(place) else place.absolute()
     return plain({k: v for k, v in values.items() if k not in ("hosts", "host", "coordinator")})
 
 

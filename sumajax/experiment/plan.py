@@ -18,7 +18,7 @@ from sumajax.evaluation import EPISODES
 from sumajax.learning import LearnerConfig
 from sumajax.learning.scaling import for_stage
 from sumajax.policies import Policy, make_policy
-from sumajax.transfer import checkpoints_of
+from sumajax.sources import source_of
 
 MAX_EPOCHS = 100_000
 """Updates are counted in 32 bits, and an epoch has at most 20,000."""
@@ -37,7 +37,7 @@ class Stage:
         task's size.
       epochs: of 20,000 environment steps each.
       start: name of an earlier stage whose parameters it goes on from; a `Path` of checkpoints made
-        elsewhere; None: fresh parameters.
+        elsewhere, or of the name of a trained policy of the package; None: fresh parameters.
       learner: its settings; `for_stage` makes of them what is trained here.
       carry_optimiser: take the optimiser's memory over with the parameters.
       leave_out: modules of the policy whose parameters are not taken over, as `state_encoder`.
@@ -224,7 +224,7 @@ def _described(stage: Stage) -> dict[str, Any]:
 def _identity(start: Path) -> str | None:
     """None where nothing is there any more: a stage that has begun does not need it."""
     try:
-        return checkpoint.identity(checkpoints_of(start))
+        return source_of(start).identity()
     except checkpoint.CheckpointError:
         return None
 

@@ -13,6 +13,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+import numpy as np
+
 from sumajax.reporting.metrics import COLUMNS, write_text
 
 LoggerName = Literal["tensorboard", "wandb"]
@@ -114,8 +116,9 @@ class TensorBoard:
 class WeightsAndBiases:
     """One W&B run for the whole experiment, gone on with when the experiment is.
 
-    Figures are called <arm>/seed_<n>/<column>, over <arm>/env_steps. The project is `sumajax`; the
-    library's own variables (WANDB_PROJECT, WANDB_MODE=offline and so on) come first.
+    Figures are called <arm>/seed_<n>/<column>, over <arm>/env_steps, and their means over the
+    seeds, what a sweep goes by, <arm>/mean/<column>. The project is `sumajax`; the library's own
+    variables (WANDB_PROJECT, WANDB_MODE=offline and so on) come first.
 
     Raises:
       ValueError: where W&B starts no run, as without a key; before anything is trained.
@@ -124,7 +127,7 @@ class WeightsAndBiases:
     def __init__(self, directory: Path, config: Mapping[str, Any]) -> None:
         import wandb
 
-        self._known: set[tuple[str, int]] = set()
+        self._known: set[tuple[str, str]] = set()
         try:
             self._run = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "sumajax"),
@@ -146,13 +149,19 @@ class WeightsAndBiases:
         """Nothing to do: W&B takes no figure back, a later one at the same place follows it."""
 
     def log(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        rows = list(rows)
         for row in rows:
-            arm, prefix = row["arm"], f"{row['arm']}/seed_{row['seed']}"
-            if (arm, row["seed"]) not in self._known:
-                self._known.add((arm, row["seed"]))
-                self._run.define_metric(f"{prefix}/*", step_metric=f"{arm}/env_steps")
-            figures = {f"{prefix}/{name}": value for name, value in _numbers(row).items()}
-            self._run.log({f"{arm}/env_steps": row["env_steps"], **figures})
+            self._log(row["arm"], f"seed_{row['seed']}", row["env_steps"], _numbers(row))
+        for (arm, _), of_epoch in _by_epoch(rows).items():
+            env_steps = int(np.mean([row["env_steps"] for row in of_epoch]))
+            self._log(arm, "mean", env_steps, _means(map(_numbers, of_epoch)))
+
+    def _log(self, arm: str, what: str, env_steps: int, numbers: Mapping[str, float]) -> None:
+        if (arm, what) not in self._known:
+            self._known.add((arm, what))
+            self._run.define_metric(f"{arm}/{what}/*", step_metric=f"{arm}/env_steps")
+        figures = {f"{arm}/{what}/{name}": value for name, value in numbers.items()}
+        self._run.log({f"{arm}/env_steps": env_steps, **figures})
 
     def close(self) -> None:
         self._run.finish()
@@ -186,6 +195,23 @@ def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
     """The figures of a row that have a value."""
     values = {name: float(row[name]) for name in FIGURES}
     return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def _by_epoch(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[str, int], list[Mapping[str, Any]]]:
+    """The rows of all seeds, by arm and epoch."""
+    found: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        found.setdefault((row["arm"], row["epoch"]), []).append(row)
+    return found
+
+
+def _means(of_seeds: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Of each figure over the seeds that have it."""
+    values: dict[str, list[float]] = {}
+    for numbers in of_seeds:
+        for name, value in numbers.items():
+            values.setdefault(name, []).append(value)
+    return {name: float(np.mean(value)) for name, value in values.items()}
 
 
 def _identity(file: Path) -> str:

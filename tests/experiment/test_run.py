@@ -17,6 +17,7 @@ from sumajax import load_agent
 from sumajax.environments import PredatorPrey
 from sumajax.experiment import Experiment, Stage, run_experiment
 from sumajax.experiment.directory import claimed
+from sumajax.experiment.marl_eval import marl_eval
 from sumajax.experiment.plan import described
 from sumajax.experiment.run import Where
 from sumajax.experiment.summary import table
@@ -254,3 +255,33 @@ class TestChain:
         assert load_agent(run[0]).env == self.LONG
         first = load_agent(run[0] / "checkpoints" / "3x3-2")
         assert first.env == self.STAGES[0].env
+
+
+def test_its_results_in_the_form_of_marl_eval(finished):
+    """Environment, task, algorithm, seed, step; every step has the same metrics, each a list."""
+    directory, summary, _ = finished
+    found = marl_eval([directory])
+    assert list(found) == ["PredatorPrey"]
+    of_task = found["PredatorPrey"]["6x6, 3 agents"]
+    assert set(of_task) == {"ic3net, transfer", "ic3net, scratch"}
+    assert list(found["PredatorPrey"]["3x3, 2 agents, seen at 6x6"]) == ["ic3net, source"]
+    for algorithm, of_seeds in of_task.items():
+        assert list(of_seeds) == ["seed_0", "seed_1"]
+        for place, of_seed in enumerate(of_seeds.values()):
+            *steps, last = of_seed
+            assert steps == [f"step_{i}" for i in range(len(steps))]
+            assert last == "absolute_metrics"
+            counts = [of_seed[step]["step_count"] for step in steps]
+            times = [of_seed[step]["elapsed_time"] for step in steps]
+            assert counts == sorted(set(counts))
+            assert counts[-1] == 40_000
+            assert times == sorted(times)
+            metrics = {"steps_taken", "success", "return"}
+            for step in steps:
+                assert set(of_seed[step]) == {"step_count", "elapsed_time"} | metrics
+                assert all(len(of_seed[step][name]) == 1 for name in metrics)
+            role = algorithm.removeprefix("ic3net, ")
+            evaluated = summary[role]["evaluation"]["sampled"]["steps_taken"]
+            assert of_seed["absolute_metrics"]["steps_taken"] == [evaluated[place]]
+    assert "step_0" in of_task["ic3net, transfer"]["seed_0"]
+    assert of_task["ic3net, transfer"]["seed_0"]["step_0"]["step_count"] == 0, "zero shot"

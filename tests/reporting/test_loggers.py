@@ -113,8 +113,22 @@ def test_wandb_is_one_run_that_goes_on(runs, tmp_path):
     assert runs[0].steps == {
         "source/seed_0/*": "source/env_steps",
         "source/seed_3/*": "source/env_steps",
+        "source/mean/*": "source/env_steps",
     }
     assert runs[0].finished
+
+
+def test_wandb_gets_the_mean_over_the_seeds_that_have_a_number(runs, tmp_path):
+    """What a sweep goes by: one figure of an epoch, however many seeds are trained."""
+    of_seeds = rows_of("source", [0, 3], 1, {"env_steps": [20_000, 40_000], "success": 0.5})
+    of_seeds[0]["steps_taken"], of_seeds[1]["steps_taken"] = 8.0, 9.0
+    of_seeds[2]["steps_taken"] = 7.0  # the other seed has stopped
+    with Loggers(["wandb"], tmp_path) as loggers:
+        loggers.log(of_seeds)
+    assert [figures for figures in runs[0].logged if "source/mean/success" in figures] == [
+        {"source/env_steps": 20_000, "source/mean/steps_taken": 8.5, "source/mean/success": 0.5},
+        {"source/env_steps": 40_000, "source/mean/steps_taken": 7.0, "source/mean/success": 0.5},
+    ]
 
 
 def test_wandb_without_a_key_is_one_sentence(tmp_path, monkeypatch):
