@@ -1,57 +1,79 @@
 """The paper's claims, each with a verdict that a stated rule takes from the kept numbers."""
 
 import math
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from experiments.paper.arms import SOURCE, SOURCE_PLAIN
 from experiments.paper.published import EXPERIMENTS, LARGEST_RATIO, SOURCES
 from experiments.paper.statistics import (
-    BEST_EPOCHS,
+    LEAST_SEEDS,
+    SOLVED,
+    WINDOW_EPOCHS,
     Comparison,
-    Estimate,
+    Curves,
+    Ratio,
     Row,
+    Sample,
+    Spread,
     comparison_of,
     curves_of,
-    estimate,
-    iqm,
-    ratio_of,
+    mean_of,
+    median_of,
+    pairs,
+    ratio_of_means,
 )
 
-HOLDS, IN_PART, FAILS, NOT_RUN = "holds", "holds in part", "does not hold", "not run yet"
+HOLDS, IN_PART, FAILS, OPEN = "holds", "holds in part", "does not hold", "open"
+NOT_RUN = "not run yet"
 
 MARGIN = 1.10
-"""Up to so many times the steps taken two arms count as equal."""
-SOLVED = 30.0
-"""Steps taken that count as success on the target: the paper's transferred policies got there."""
+"""Up to so many times the steps taken two runs count as equal, and an arm as settled."""
 AT_RANDOM = 0.9
 """Share of the step limit from which the paper's scratch row counts as a failure."""
 FALLEN_BACK = 1.5
 """Times its best at which an arm's end is called a fall: a ratio at the hour then hangs on when."""
-LEAST_SEEDS = 3
+SOURCE_SOLVED = 10.0
+"""Steps taken on the small task that count as solved: about twice the shortest paths."""
+FEW_HOURS = 10.0
+"""Of the paper's hours, that its "few hours after transfer" are read as at most."""
+LONG_HOURS = 400.0
+"""In which the paper's PCP runs from scratch made no progress."""
+CAPTURE = ("pcp-hetnet-2p1c", "pcp-hetnet-3p2c")
 
 RULES = f"""\
-* An interval is that of the interquartile mean over seeds (95%, bootstrap); "at the hour" is the
-  mean over the epochs of the hour before the paper's fixed hour T, epochs converted by the paper's
-  own seconds per epoch, the source's counted. Where a budget ends before T it is the last hour that
-  both arms have, and the table says so.
-* Q1 holds when the interval of steps taken with over without upsampling ends at or below
-  {MARGIN:g}, holds in part when it contains {MARGIN:g}, and does not hold above; both are means
-  over the last tenth of the epochs.
-* Q2 of a row holds when the ratio scratch/transfer at the hour is at least the paper's and its
-  interval lies above {MARGIN:g}, holds in part when only the interval lies above {MARGIN:g}, and
-  does not hold otherwise.
-* "Up to {LARGEST_RATIO:g}x": the same rule, for the row with the largest ratio; until all rows have
-  been run only a row that reaches {LARGEST_RATIO:g} decides it.
-* "Scratch fails where transfer succeeds" is about the rows in which the paper's scratch stayed at
-  {AT_RANDOM:.0%} of the step limit or more and its transfer came near {SOLVED:g}. In a row it holds
-  when every transferred seed and no seed from scratch came to {SOLVED:g} steps within its budget,
-  in part when more transferred seeds did; over the rows it holds when it does in all, in part when
-  it does in part in any.
+* Everything is a mean over seeds with the least and the greatest seed; times are medians. Nothing
+  is concluded from fewer than {LEAST_SEEDS} seeds in an arm: such a line is "{OPEN}".
+* Two arms are compared by **all pairs** of a run of the one with a run of the other. "More" is said
+  when every pair lies on the same side of {MARGIN:g}; by chance alone that happens to arms that do
+  not differ in 2 of 252 draws of five and five seeds for either side, and in 2 of 20 of three and
+  three: three seeds are weak evidence.
+* Budgets are in the table below. Where one ends before the paper's fixed hour T, its end stands for
+  T if both arms have settled: no seed's mean over the last tenth of its epochs is more than
+  {MARGIN:g} times off the tenth before. While a seed still moves the line is "{OPEN}", whichever
+  way it points. Under preset `fast` the learning rate falls to the budget's end, which settles an
+  arm too.
+* Q1 holds when every pair upsampled/not upsampled lies at or below {MARGIN:g}, does not when every
+  pair lies above; else it is open. (Means over the last tenth of the epochs.)
+* Q2 of a row: the paper ran each arm once, so it can bear a direction, and a size up to what
+  single runs scatter. It holds when every pair scratch/transfer at T lies above {MARGIN:g} and one
+  comes to the paper's ratio; in part when every pair lies above {MARGIN:g} and none comes to it; it
+  does not hold when every pair lies at or below {MARGIN:g}; else it is open.
+* "Up to {LARGEST_RATIO:g}x": the rule of Q2 for the row with the largest ratio of all five, once
+  all have {LEAST_SEEDS} seeds; one that comes to {LARGEST_RATIO:g} decides it before.
+* "Scratch fails where transfer succeeds", in the rows in which the paper's scratch stayed at
+  {AT_RANDOM:.0%} of the step limit or more and its transfer came near {SOLVED:g}: holds when every
+  transferred seed and no seed from scratch came to {SOLVED:g} steps by T, does not hold when more
+  than half of the seeds from scratch came (who has come, has: no budget is too short for that), in
+  part when fewer came and every transferred seed did.
+* A time is shorter when it is for every pair; who never came within the budget took longer than the
+  budget.
+* Over several rows a claim has the verdict that all have, or it is said how many have which.
 * An arm "fell back" when the mean over its last tenth is over {FALLEN_BACK:g} times the least
-  mean of {BEST_EPOCHS} epochs in a row; no verdict depends on it, but its ratio is worth little.
-* Nothing more than "holds in part" is said with fewer than {LEAST_SEEDS} seeds, and, but for Q1,
-  where the budget ends before the paper's hour: what scratch would have come to is not known then.
+  mean of {WINDOW_EPOCHS} epochs in a row; no verdict depends on it, but its ratio is worth little.
 """
 
 
@@ -71,33 +93,79 @@ def claims(rows: Iterable[Row], preset: str) -> list[Claim]:
     """Every claim under one preset, in the paper's order."""
     rows = list(rows)
     compared = {name: comparison_of(rows, name, preset) for name in EXPERIMENTS}
+    known = {name: c for name, c in compared.items() if c is not None}
     return [
         *(_source_unharmed(rows, name, preset) for name in SOURCES),
+        _longer_on_the_source(rows, preset),
+        _sources_converged(rows, preset),
         *(_transfer_better(name, compared[name], preset) for name in EXPERIMENTS),
-        _largest([c for c in compared.values() if c is not None], preset),
-        _scratch_fails(compared, preset),
+        _largest(list(known.values()), preset),
+        _sooner(known, preset),
+        _with_less_experience(known, preset),
+        _scratch_fails(known, preset),
+        _no_progress(known, preset),
+        _within_hours(known, preset),
     ]
 
 
 def _source_unharmed(rows: list[Row], name: str, preset: str) -> Claim:
-    row = EXPERIMENTS[name]
-    title = f"Q1, {row.source_title} on the source: upsampling does no harm"
+    title = f"Q1, {EXPERIMENTS[name].source_title} on the source: upsampling does no harm"
     claim = Claim(title, preset, "similar (no figure given)", "", NOT_RUN, "")
     arms = [curves_of(rows, name, arm, preset) for arm in (SOURCE, SOURCE_PLAIN)]
-    if any(arm is None for arm in arms):
+    upsampled, plain = arms
+    if upsampled is None or plain is None:
         return claim
-    lasts = [arm.last for arm in arms if arm is not None]
-    found = estimate(ratio_of(iqm), *lasts)
-    with_it, without = (estimate(iqm, last) for last in lasts)
-    verdict = FAILS
-    if _low(found) <= MARGIN:
-        verdict = HOLDS if _high(found) <= MARGIN else IN_PART
-    return replace(
-        claim,
-        ours=f"{said(found, 3)}x",
-        verdict=_capped(verdict, found),
-        reason=f"{said(with_it)} steps with upsampling, {said(without)} without.",
+    verdict = OPEN
+    if _enough(upsampled, plain) and _settled(upsampled, plain):
+        verdict = _sides(pairs(upsampled.last, plain.last), low=HOLDS, high=FAILS)
+    ratio = ratio_of_means(upsampled.last, plain.last)
+    reason = (
+        f"{spread(mean_of(upsampled.last))} steps with upsampling, "
+        f"{spread(mean_of(plain.last))} without; {_pairs(upsampled.last, plain.last)}"
     )
+    return replace(
+        claim, ours=f"{said(ratio, 3)}x", verdict=verdict, reason=reason + _why_open(arms)
+    )
+
+
+def _longer_on_the_source(rows: list[Row], preset: str) -> Claim:
+    name = "pp-hetnet"
+    title = "HetNet takes longer to converge on the PP source under upsampling"
+    claim = Claim(title, preset, "said of Figure 2a", "", NOT_RUN, "")
+    upsampled, plain = (curves_of(rows, name, arm, preset) for arm in (SOURCE, SOURCE_PLAIN))
+    if upsampled is None or plain is None:
+        return claim
+    steps = [arm.env_steps_to(SOURCE_SOLVED) for arm in (upsampled, plain)]
+    hours = [arm.cost_to(SOURCE_SOLVED, arm.hours) for arm in (upsampled, plain)]
+    verdict = _sides(_times_pairs(*hours), low=FAILS, high=HOLDS, margin=1.0)
+    ours = " h, ".join(spread(median_of(sample), 3) for sample in hours) + " h"
+    reason = (
+        f"The paper's hours to {SOURCE_SOLVED:g} steps, with upsampling and without; in M "
+        f"environment steps {' and '.join(spread(median_of(sample), 3) for sample in steps)}."
+    )
+    return replace(
+        claim, ours=ours, verdict=verdict if _enough(upsampled, plain) else OPEN, reason=reason
+    )
+
+
+def _sources_converged(rows: list[Row], preset: str) -> Claim:
+    title = "The policy has converged on the source when it is transferred"
+    claim = Claim(title, preset, "condition of the method", "", NOT_RUN, "")
+    found = {name: curves_of(rows, name, SOURCE, preset) for name in SOURCES}
+    known = {name: arm for name, arm in found.items() if arm is not None}
+    if not known:
+        return claim
+    verdicts = {
+        name: (HOLDS if _settled(arm) else FAILS) if _enough(arm) else OPEN
+        for name, arm in known.items()
+    }
+    ours = "; ".join(
+        f"{name}: {spread(mean_of(arm.last))} after {len(arm.epochs)} epochs, "
+        f"{'settled' if _settled(arm) else 'still moving'}, {_seeds(arm)}"
+        for name, arm in known.items()
+    )
+    reason = f"Rows: {_rows(verdicts)}. Moving: over {MARGIN:g} times from a tenth to the next."
+    return replace(claim, ours=ours, verdict=_over(verdicts), reason=reason)
 
 
 def _transfer_better(name: str, compared: Comparison | None, preset: str) -> Claim:
@@ -106,63 +174,120 @@ def _transfer_better(name: str, compared: Comparison | None, preset: str) -> Cla
     claim = Claim(f"Q2, {row.title}", preset, paper, "", NOT_RUN, "")
     if compared is None:
         return claim
-    found = estimate(ratio_of(iqm), *compared.final)
-    scratch, transfer = (estimate(iqm, sample) for sample in compared.final)
-    ours = f"{said(found)}x at {compared.hour:.3g} h ({said(scratch)} -> {said(transfer)})"
-    verdict = _ratio_verdict(found, row.ratio, compared)
-    return replace(claim, ours=ours, verdict=verdict, reason=_why(compared))
+    found = compared.equal(compared.papers_hours)
+    if found.transfer is None:
+        return replace(claim, verdict=OPEN, reason="The budgets end before the source's hours do.")
+    ratio = ratio_of_means(found.scratch, found.transfer, compared.of_one_kind)
+    ours = (
+        f"{said(ratio)}x at {compared.hour:.3g} h "
+        f"({spread(mean_of(found.scratch))} -> {spread(mean_of(found.transfer))})"
+    )
+    verdict = _ratio_verdict(compared, row.ratio)
+    reason = f"{_pairs(found.scratch, found.transfer)[:-1]}; {_why(compared)}"
+    return replace(claim, ours=ours, verdict=verdict, reason=reason)
 
 
-def _ratio_verdict(found: Estimate, paper: float, compared: Comparison) -> str:
-    if _low(found) <= MARGIN:
-        return FAILS
-    verdict = HOLDS if found.value >= paper else IN_PART
-    return _capped(verdict, found, compared)
+def _ratio_verdict(compared: Comparison, paper: float) -> str:
+    found = compared.equal(compared.papers_hours)
+    if found.transfer is None or not _decides(compared):
+        return OPEN
+    ratios = pairs(found.scratch, found.transfer)
+    return _sides(ratios, low=FAILS, high=HOLDS if ratios.max() >= paper else IN_PART)
+
+
+def _decides(compared: Comparison) -> bool:
+    """Whether there are seeds enough, and the budget is one from which something follows."""
+    arms = (compared.scratch, compared.transfer)
+    return _enough(*arms) and (compared.at_the_papers_hour or _settled(*arms))
 
 
 def _why(compared: Comparison) -> str:
-    """Where the advantage is, as far as the curves show it."""
-    best, at = compared.largest(counted=False)
-    text = f"Largest on the way: {best:.1f}x after {at / 1e6:.2f} M target steps"
-    best, at = compared.largest(counted=True)
-    if not math.isnan(best):
-        text += f", {best:.1f}x at {at / 1e6:.2f} M when the source's steps count"
+    """Who came, who fell back, and how far the budget goes."""
     arms = (("transferred", compared.transfer), ("scratch", compared.scratch))
-    reached = [
-        (words, f"{(arm.env_steps_to(SOLVED) < math.inf).sum()} of {len(arm.filled)}")
-        for words, arm in arms
-    ]
-    text += f"; {SOLVED:g} steps reached by " + " and ".join(f"{n} {w} seeds" for w, n in reached)
+    text = f"{SOLVED:g} steps reached by " + " and ".join(
+        f"{arm.came_to(SOLVED)} of {len(arm.filled)} {words} seeds" for words, arm in arms
+    )
     for words, arm in arms:
         best, at = arm.best
-        if (end := float(iqm(arm.last))) > FALLEN_BACK * best:
+        if (end := float(arm.last.mean())) > FALLEN_BACK * best:
             text += f"; {words} fell back from {best:.3g} steps at {at / 1e6:.2f} M to {end:.3g}"
     if not compared.at_the_papers_hour:
         text += f"; the budget ends at {compared.hour:.3g} of the paper's {compared.row.hours:g} h"
-    return text + "."
+        moving = not _settled(compared.scratch, compared.transfer)
+        text += f", {'with seeds still moving' if moving else 'all seeds settled'}"
+    return text + _few(*(arm for _, arm in arms)) + "."
 
 
 def _largest(compared: list[Comparison], preset: str) -> Claim:
-    claim = Claim(
-        f"Up to {LARGEST_RATIO:g}x", preset, f"{LARGEST_RATIO:g}x (PCP 3P/2C)", "", NOT_RUN, ""
-    )
-    if not compared:
+    title, paper = f"Up to {LARGEST_RATIO:g}x", f"{LARGEST_RATIO:g}x (PCP 3P/2C)"
+    claim = Claim(title, preset, paper, "", NOT_RUN, "")
+    found = []
+    for comparison in compared:
+        equal = comparison.equal(comparison.papers_hours)
+        if equal.transfer is not None:
+            ratio = ratio_of_means(equal.scratch, equal.transfer, comparison.of_one_kind)
+            found.append((ratio, comparison))
+    if not found:
         return claim
-    found = [(estimate(ratio_of(iqm), *c.final), c) for c in compared]
     best, where = max(found, key=lambda pair: pair[0].value)
-    missing = len(EXPERIMENTS) - len(compared)
-    verdict = _ratio_verdict(best, LARGEST_RATIO, where)
-    if missing and best.value < LARGEST_RATIO:
-        verdict = NOT_RUN
+    verdict = _ratio_verdict(where, LARGEST_RATIO)
+    decided = sum(_decides(comparison) for _, comparison in found)
+    if decided < len(EXPERIMENTS) and verdict != HOLDS:
+        verdict = OPEN
     return replace(
         claim,
         ours=f"{said(best)}x ({where.row.title})",
         verdict=verdict,
-        reason=f"Of {len(compared)} rows" + (f"; {missing} not run yet." if missing else "."),
+        reason=f"{decided} of {len(EXPERIMENTS)} rows have seeds and budgets that decide.",
     )
 
 
-def _scratch_fails(compared: dict[str, Comparison | None], preset: str) -> Claim:
+def _sooner(known: Mapping[str, Comparison], preset: str) -> Claim:
+    return _times_claim(
+        f"Less aggregate time to a target performance ({SOLVED:g} steps), source in",
+        "all five rows, by its hours",
+        known,
+        preset,
+        lambda compared: compared.times_to(SOLVED, compared.papers_hours),
+        "The paper's hours",
+    )
+
+
+def _with_less_experience(known: Mapping[str, Comparison], preset: str) -> Claim:
+    return _times_claim(
+        f"Less training experience to a target performance ({SOLVED:g} steps), source in",
+        "said in the conclusion",
+        known,
+        preset,
+        lambda compared: compared.times_to(SOLVED, compared.env_steps),
+        "M environment steps",
+    )
+
+
+def _times_claim(
+    title: str,
+    paper: str,
+    known: Mapping[str, Comparison],
+    preset: str,
+    times: Callable[[Comparison], tuple[Sample, Sample]],
+    unit: str,
+) -> Claim:
+    """Of every row: transfer came there before scratch did."""
+    if not known:
+        return Claim(title, preset, paper, "", NOT_RUN, "")
+    verdicts, parts = {}, []
+    for name, compared in known.items():
+        scratch, transfer = times(compared)
+        verdicts[name] = OPEN
+        if _enough(compared.scratch, compared.transfer):
+            ratios = _times_pairs(scratch, transfer)
+            verdicts[name] = _sides(ratios, low=FAILS, high=HOLDS, margin=1.0)
+        parts.append(f"{name}: {spread(median_of(scratch), 3)} -> {spread(median_of(transfer), 3)}")
+    reason = f"{unit}, scratch -> transfer. Rows: {_rows(verdicts)}."
+    return Claim(title, preset, paper, "; ".join(parts), _over(verdicts), reason)
+
+
+def _scratch_fails(known: Mapping[str, Comparison], preset: str) -> Claim:
     names = [
         name
         for name, row in EXPERIMENTS.items()
@@ -170,51 +295,153 @@ def _scratch_fails(compared: dict[str, Comparison | None], preset: str) -> Claim
     ]
     title = "Scratch fails where transfer succeeds"
     paper = f"scratch at random level, transfer near {SOLVED:g} ({', '.join(names)})"
-    known = [(name, c) for name in names if (c := compared[name]) is not None]
-    if not known:
+    verdicts, counts = {}, []
+    for name in names:
+        if name not in known:
+            verdicts[name] = NOT_RUN
+            continue
+        compared = known[name]
+        verdicts[name] = _failing(compared)
+        counts.append(f"{name}: {_came(compared)}")
+    if not counts:
         return Claim(title, preset, paper, "", NOT_RUN, "")
-    verdicts, counts = [], []
-    for name, comparison in known:
-        transferred, scratch = (
-            arm.env_steps_to(SOLVED) < math.inf for arm in (comparison.transfer, comparison.scratch)
+    reason = f"Seeds that reached {SOLVED:g} steps within their budgets. Rows: {_rows(verdicts)}."
+    return Claim(title, preset, paper, "; ".join(counts), _over(verdicts), reason)
+
+
+def _failing(compared: Comparison) -> str:
+    scratch, transfer = (arm.came_to(SOLVED) for arm in (compared.scratch, compared.transfer))
+    all_transferred = transfer == len(compared.transfer.filled)
+    if not _enough(compared.scratch, compared.transfer):
+        return OPEN
+    if 2 * scratch > len(compared.scratch.filled):
+        return FAILS
+    if not all_transferred or not _decides(compared):
+        return OPEN
+    return IN_PART if scratch else HOLDS
+
+
+def _came(compared: Comparison) -> str:
+    arms = (("transferred", compared.transfer), ("from scratch", compared.scratch))
+    return ", ".join(f"{arm.came_to(SOLVED)} of {len(arm.filled)} {words}" for words, arm in arms)
+
+
+def _no_progress(known: Mapping[str, Comparison], preset: str) -> Claim:
+    title = f"PCP from scratch: no high performance in over {LONG_HOURS:g} hours"
+    paper = "none of its two runs"
+    arms = {name: known[name].scratch for name in CAPTURE if name in known}
+    if not arms:
+        return Claim(title, preset, paper, "", NOT_RUN, "")
+    verdicts, parts = {}, []
+    for name, arm in arms.items():
+        hours, came = arm.cost_to(SOLVED, arm.hours), arm.came_to(SOLVED)
+        verdicts[name] = OPEN
+        if _enough(arm):
+            verdicts[name] = FAILS if 2 * came > len(hours) else OPEN
+            if arm.hours[-1] >= LONG_HOURS and not came:
+                verdicts[name] = HOLDS
+        parts.append(
+            f"{name}: {came} of {len(hours)} came to {SOLVED:g}, after "
+            f"{spread(median_of(hours), 3)} h of {arm.hours[-1]:.3g}; at the end "
+            f"{spread(mean_of(arm.last))} steps"
         )
-        verdict = IN_PART if transferred.mean() > scratch.mean() else FAILS
-        verdict = HOLDS if transferred.all() and not scratch.any() else verdict
-        few = Estimate(0.0, seeds=min(len(transferred), len(scratch)))
-        verdicts.append(_capped(verdict, few, comparison))
-        counts.append(
-            f"{name}: {transferred.sum()} of {len(transferred)} transferred, "
-            f"{scratch.sum()} of {len(scratch)} from scratch"
-        )
-    verdict = HOLDS if all(v == HOLDS for v in verdicts) else IN_PART
-    verdict = FAILS if all(v == FAILS for v in verdicts) else verdict
-    missing = f"; rows not run yet: {len(names) - len(known)}" if len(known) < len(names) else ""
-    if missing and verdict == HOLDS:
-        verdict = IN_PART
-    reason = f"Seeds that reached {SOLVED:g} steps within their budgets{missing}."
-    return Claim(title, preset, paper, "; ".join(counts), verdict, reason)
+    reason = f"The paper's hours. Rows: {_rows(verdicts)}."
+    return Claim(title, preset, paper, "; ".join(parts), _over(verdicts), reason)
 
 
-def _capped(verdict: str, found: Estimate, compared: Comparison | None = None) -> str:
-    """No `holds` from too few seeds or too short a budget."""
-    short = compared is not None and not compared.at_the_papers_hour
-    return IN_PART if verdict == HOLDS and (short or found.seeds < LEAST_SEEDS) else verdict
+def _within_hours(known: Mapping[str, Comparison], preset: str) -> Claim:
+    title = "PCP: high performance within a few hours after transfer"
+    paper = "said of Figure 2d"
+    arms = {name: known[name].transfer for name in CAPTURE if name in known}
+    if not arms:
+        return Claim(title, preset, paper, "", NOT_RUN, "")
+    verdicts, parts = {}, []
+    for name, arm in arms.items():
+        hours = arm.cost_to(SOLVED, arm.hours)
+        few = _sides(hours / FEW_HOURS, low=HOLDS, high=FAILS, margin=1.0)
+        verdicts[name] = few if _enough(arm) else OPEN
+        parts.append(f"{name}: {spread(median_of(hours), 3)} h, {_seeds(arm)}")
+    reason = (
+        f"The paper's hours on the target to {SOLVED:g} steps; few are at most {FEW_HOURS:g}. "
+        f"Rows: {_rows(verdicts)}."
+    )
+    return Claim(title, preset, paper, "; ".join(parts), _over(verdicts), reason)
 
 
-def _low(found: Estimate) -> float:
-    return found.value if found.low is None else found.low
+def _sides(ratios: np.ndarray, low: str, high: str, margin: float = MARGIN) -> str:
+    """`high` when every ratio lies above the margin, `low` when none does, else open."""
+    above = ratios > margin
+    return high if above.all() else OPEN if above.any() else low
 
 
-def _high(found: Estimate) -> float:
-    return found.value if found.high is None else found.high
+def _times_pairs(first: Sample, second: Sample) -> np.ndarray:
+    """As `pairs`, of times; where neither came, 1: neither was sooner."""
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(pairs(first, second), nan=1.0, posinf=math.inf)
 
 
-def said(found: Estimate, digits: int = 4) -> str:
-    """A number with its interval, as a cell."""
+def _enough(*arms: Curves) -> bool:
+    return min(len(arm.filled) for arm in arms) >= LEAST_SEEDS
+
+
+def _settled(*arms: Curves) -> bool:
+    """Whether no seed of the arms still moves."""
+    return all(((arm.moves <= MARGIN) & (arm.moves >= 1 / MARGIN)).all() for arm in arms)
+
+
+def _over(verdicts: Mapping[str, str]) -> str:
+    """Of several rows together: what all have, or how many have which."""
+    counts = Counter(verdicts.values())
+    if len(counts) == 1:
+        return next(iter(counts))
+    return ", ".join(f"{verdict} in {many}" for verdict, many in counts.items())
+
+
+def _rows(verdicts: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items())
+
+
+def _pairs(first: Sample, second: Sample) -> str:
+    ratios = pairs(first, second)
+    if len(ratios) == 1:
+        return f"one pair, {number(float(ratios[0]), 3)}."
+    return f"pairs {number(ratios.min(), 3)} to {number(ratios.max(), 3)}."
+
+
+def _few(*arms: Curves) -> str:
+    seeds = min(len(arm.filled) for arm in arms)
+    if seeds >= LEAST_SEEDS:
+        return ""
+    return f"; {_seeds(min(arms, key=lambda arm: len(arm.filled)))} of an arm, no evidence"
+
+
+def _seeds(arm: Curves) -> str:
+    many = len(arm.filled)
+    return f"{many} seed{'s' if many > 1 else ''}"
+
+
+def _why_open(arms: Iterable[Curves | None]) -> str:
+    known = [arm for arm in arms if arm is not None]
+    text = _few(*known).removeprefix("; ")
+    if not _settled(*known):
+        text += "; " * bool(text) + "still moving"
+    return f" {text[0].upper()}{text[1:]}." if text else ""
+
+
+def said(found: Ratio, digits: int = 4) -> str:
+    """A ratio with its interval, as a cell."""
     text = ("> " if found.at_least else "") + number(found.value, digits)
     if found.low is None or found.high is None or math.isnan(found.value):
         return text
     return f"{text} [{number(found.low, digits)}, {number(found.high, digits)}]"
+
+
+def spread(found: Spread, digits: int = 4) -> str:
+    """A number over seeds with their range, as a cell."""
+    text = number(found.value, digits)
+    if found.seeds == 1:
+        return text
+    return f"{text} ({number(found.least, digits)}-{number(found.most, digits)})"
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -223,6 +450,4 @@ def number(value: float, digits: int = 4) -> str:
         return "-"
     if math.isinf(value):
         return "never"
-    if value >= 10_000:  # environment steps
-        return f"{value / 1e6:.3g} M"
     return f"{value:#.{digits}g}".rstrip(".")

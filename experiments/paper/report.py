@@ -1,7 +1,6 @@
 """Tables, figures and the report of the paper's reproduction, all from the kept CSV files."""
 
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -9,29 +8,48 @@ from typing import Any, get_args
 import numpy as np
 
 from experiments.paper.arms import ABLATIONS, SCRATCH, SOURCE, SOURCE_PLAIN, TABLE_2, TRANSFER, Arm
-from experiments.paper.claims import NOT_RUN, RULES, Claim, claims, number, said
-from experiments.paper.figures import figure_2
+from experiments.paper.claims import NOT_RUN, RULES, Claim, claims, number, said, spread
+from experiments.paper.figures import AXES, figure_2, targets
 from experiments.paper.parts import ABLATED, Budget, Part, PresetName, unchanged_arms
 from experiments.paper.published import EXPERIMENTS, SOURCES
 from experiments.paper.results import Results, write_csv
 from experiments.paper.statistics import (
     STATISTICS_COLUMNS,
+    THRESHOLDS,
+    Accounting,
     Comparison,
-    Estimate,
+    Ratio,
     Row,
-    aggregate,
+    Spread,
+    accountings,
     comparison_of,
     curves_of,
-    estimate,
-    iqm,
-    middle,
-    ratio_of,
+    mean_of,
+    median_of,
+    pair_rows,
+    ratio_of_means,
+    ratio_of_medians,
     statistics,
 )
 from sumajax.reporting import write_text
 
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 PROVENANCE = "provenance"
+
+COSTS = """\
+Three accountings, the source's cost in each: the paper's hours (epochs times its Table II),
+environment steps, and minutes here (epochs times our Table II: one seed alone, one pass, the
+machine not idle, so that two rows of equal work, MAGIC's on the target, differ by 30%; preset
+`paper` has none yet). Steps taken are the mean over the hour before for the first, over ten epochs
+before for the others; times are medians until an epoch's mean is that low. An interval of a ratio
+is Student's on logarithms, given with three seeds or more in both arms while an arm's seeds all
+came to 30 steps or none did."""
+
+BUDGETS = """\
+Preset `paper`: the paper's pre-training, then until its fixed hour T. Preset `fast`: 1.0 M steps on
+the source; on the target 2.5 M for IC3Net, 1.2 M for MAGIC, and for HetNet 3.0 M, set after scratch
+had been seen not to learn within 1.2 M (arms `-brief`, kept for Predator-Prey). A budget is stated
+before the run by `experiments/paper/parts.py`."""
 
 
 def write_report(results: Results) -> None:
@@ -43,10 +61,17 @@ def write_report(results: Results) -> None:
     all_statistics = statistics_rows(results)
     write_csv(directory / "statistics.csv", STATISTICS_COLUMNS, all_statistics)
     write_text(directory / "statistics.md", markdown(list(map(_shown, all_statistics))))
+    curves, references = results.rows["curves"], results.rows["references"]
     for preset in presets(results):
-        figure = directory / f"figure2-{preset}.png"
-        figure_2(results.rows["curves"], results.rows["references"], preset, figure)
+        for axis in AXES:
+            figure_2(curves, references, preset, axis, directory / figure_file(preset, axis.name))
+    targets(curves, references, "fast", directory / "transfer-fast.png")
     write_text(directory / "README.md", report(results))
+
+
+def figure_file(preset: str, axis: str) -> str:
+    """The file of Figure 2 under a preset, on one time axis."""
+    return f"figure2-{preset}-{axis}.png"
 
 
 def presets(results: Results) -> list[str]:
@@ -90,13 +115,124 @@ def table_1(curves: Iterable[Row]) -> list[dict[str, str]]:
 
 
 def _ours_of_table_1(compared: Comparison | None) -> dict[str, str]:
-    names = ("seeds", "at (h)", "scratch", "transfer", "ratio")
+    names = ("seeds", "at (h)", "target epochs", "scratch", "transfer", "ratio", "never at 30")
     if compared is None:
         return dict.fromkeys(names, NOT_RUN)
-    scratch, transfer = (estimate(iqm, sample) for sample in compared.final)
-    ratio = estimate(ratio_of(iqm), *compared.final)
-    cells = (f"{ratio.seeds}", f"{compared.hour:.3g}", *map(said, (scratch, transfer)))
-    return dict(zip(names, (*cells, f"{said(ratio)}x"), strict=True))
+    found = compared.equal(compared.papers_hours)
+    if found.transfer is None:
+        return dict.fromkeys(names, "the source costs more")
+    ratio = ratio_of_means(found.scratch, found.transfer, compared.of_one_kind)
+    cells = (
+        _seeds(compared),
+        f"{compared.hour:.3g}",
+        f"{found.scratch_epochs}, {found.transfer_epochs} after {len(compared.source.epochs)}",
+        spread(mean_of(found.scratch)),
+        spread(mean_of(found.transfer)),
+        f"{said(ratio)}x",
+        _failures(compared, 30.0),
+    )
+    return dict(zip(names, cells, strict=True))
+
+
+def _seeds(compared: Comparison) -> str:
+    """Of both arms, where they differ."""
+    many = dict.fromkeys(len(arm.filled) for arm in (compared.scratch, compared.transfer))
+    return ", ".join(map(str, many))
+
+
+def _failures(compared: Comparison, threshold: float) -> str:
+    """Seeds that never came to a threshold within their budget, scratch and transferred."""
+    arms = (compared.scratch, compared.transfer)
+    return ", ".join(f"{len(a.filled) - a.came_to(threshold)} of {len(a.filled)}" for a in arms)
+
+
+def seconds_here(measured: Iterable[Row]) -> dict[tuple[str, str], dict[str, float]]:
+    """This machine's seconds per epoch, by the arm's name, of each experiment and preset.
+
+    Where two experiments have one source, it was measured once.
+    """
+    measured = list(measured)
+    return {
+        (name, preset): {
+            r["arm"]: r["seconds"]
+            for r in measured
+            if r["preset"] == preset
+            and r["experiment"] == (row.source_of if r["arm"] == SOURCE.name else name)
+        }
+        for name, row in EXPERIMENTS.items()
+        for preset in PRESETS
+    }
+
+
+def costs(results: Results) -> list[dict[str, str]]:
+    """Both arms at equal cost, under every accounting, the source's cost in."""
+    here = seconds_here(results.rows["seconds_per_epoch"])
+    rows = []
+    for name, row in EXPERIMENTS.items():
+        for preset in PRESETS:
+            compared = comparison_of(results.rows["curves"], name, preset)
+            for by in accountings(compared, here[name, preset]) if compared else ():
+                assert compared is not None
+                about = {"experiment": row.title, "preset": preset, "equal": by.name}
+                rows.append(about | _at_equal_cost(compared, by))
+    return rows
+
+
+def _at_equal_cost(compared: Comparison, by: Accounting) -> dict[str, str]:
+    found = compared.equal(by)
+    cells = {
+        "at": number(found.at, 3),
+        "seeds": _seeds(compared),
+        "target epochs: scratch": f"{found.scratch_epochs}",
+        "transfer": f"{found.transfer_epochs}",
+        "steps taken: scratch": spread(mean_of(found.scratch)),
+    }
+    if found.transfer is None:
+        text = "the source alone costs more"
+        return cells | {"transferred": text, "ratio [95%]": "-"}
+    ratio = ratio_of_means(found.scratch, found.transfer, compared.of_one_kind)
+    return cells | {
+        "transferred": spread(mean_of(found.transfer)),
+        "ratio [95%]": f"{said(ratio)}x",
+    }
+
+
+def times(results: Results) -> list[dict[str, str]]:
+    """Cost until a number of steps taken, under every accounting, and who never came."""
+    here = seconds_here(results.rows["seconds_per_epoch"])
+    rows = []
+    for name, row in EXPERIMENTS.items():
+        for preset in PRESETS:
+            compared = comparison_of(results.rows["curves"], name, preset)
+            for threshold in THRESHOLDS if compared else ():
+                assert compared is not None
+                arms = (compared.scratch, compared.transfer)
+                alone = [spread(median_of(arm.env_steps_to(threshold)), 3) for arm in arms]
+                cells = {
+                    by.name: _time_cell(compared, threshold, by)
+                    for by in accountings(compared, here[name, preset])
+                }
+                rows.append(
+                    {
+                        "experiment": row.title,
+                        "preset": preset,
+                        "to": f"{threshold:g} steps",
+                        "never: scratch, transfer": _failures(compared, threshold),
+                        "target alone, M environment steps": " -> ".join(alone),
+                        **{
+                            f"source in, {by}": cells.get(by, "not measured")
+                            for by in ("M environment steps", "the paper's hours", "minutes here")
+                        },
+                    }
+                )
+    return rows
+
+
+def _time_cell(compared: Comparison, threshold: float, by: Accounting) -> str:
+    scratch, transfer = compared.times_to(threshold, by)
+    ratio = ratio_of_medians(scratch, transfer, float(by.scratch.mean(0)[-1]))
+    shown = " -> ".join(spread(median_of(sample), 3) for sample in (scratch, transfer))
+    return f"{shown}: {said(ratio, 3)}x" if ratio.value == ratio.value else shown
 
 
 MARKS = (0.1, 0.3, 0.6, 1.0, 1.2, 2.0, 2.5, 5.0, 10.0, 20.0)
@@ -165,63 +301,47 @@ def _seconds(row: Row | None, paper: float) -> str:
 def statistics_rows(results: Results) -> list[Row]:
     """Every statistic of every experiment and preset that was run, long form."""
     rows: list[Row] = []
-    curves, levels = results.rows["curves"], _levels(results.rows["references"])
+    curves = results.rows["curves"]
+    here = seconds_here(results.rows["seconds_per_epoch"])
     for preset in presets(results):
-        found = [c for name in EXPERIMENTS if (c := comparison_of(curves, name, preset))]
-        for comparison in found:
-            rows += statistics(comparison)
+        for name in EXPERIMENTS:
+            if comparison := comparison_of(curves, name, preset):
+                rows += statistics(comparison, here[name, preset])
         rows += _source_statistics(curves, preset)
-        rows += aggregate(found, levels)
     return rows
 
 
 def _source_statistics(curves: list[Row], preset: str) -> list[Row]:
     """Question Q1: the source task with and without upsampling."""
     rows: list[Row] = []
+    quantity = "steps taken on the source, last tenth of the epochs"
     for name in SOURCES:
-        arms = {arm: curves_of(curves, name, arm, preset) for arm in (SOURCE, SOURCE_PLAIN)}
-        lasts = {arm.name: found.last for arm, found in arms.items() if found is not None}
-        estimates = {arm: estimate(iqm, last) for arm, last in lasts.items()}
-        if len(lasts) == 2:
-            estimates["source/source-plain"] = estimate(ratio_of(iqm), *lasts.values())
-        blank: Row = dict.fromkeys(STATISTICS_COLUMNS)
-        rows += [
-            {
-                **blank,
-                "preset": preset,
-                "experiment": name,
-                "quantity": "steps taken on the source, last tenth of the epochs",
-                "of": of,
-                "seeds": found.seeds,
-                "value": found.value,
-                "low": found.low,
-                "high": found.high,
-            }
-            for of, found in estimates.items()
-        ]
+        upsampled, plain = (curves_of(curves, name, arm, preset) for arm in (SOURCE, SOURCE_PLAIN))
+        if upsampled is None or plain is None:
+            continue
+        names = (SOURCE.name, SOURCE_PLAIN.name)
+        samples = (upsampled.last, plain.last)
+        about = {"preset": preset, "experiment": name}
+        rows += [{**about, **row} for row in pair_rows(quantity, samples, True, names=names)]
     return rows
-
-
-def _levels(references: Iterable[Row]) -> dict[str, tuple[float, float]]:
-    return {
-        row["experiment"]: (row["random_steps_taken"], row["shortest_paths"])
-        for row in references
-        if row["task"] == "target"
-    }
 
 
 def _shown(row: Row) -> dict[str, Any]:
     """A statistic as a row of Markdown."""
-    found = Estimate(row["value"], row["low"], row["high"], row["seeds"], bool(row["at_least"]))
-    reached = row["reached"]
+    if row["least"] is None:
+        ratio = Ratio(row["value"], row["low"], row["high"], bool(row["at_least"]))
+        value = said(ratio)
+    else:
+        value = spread(Spread(row["value"], row["least"], row["most"], row["seeds"]))
+    came = f" ({row['came']} came)" if row["came"] is not None else ""
     return {
         "preset": row["preset"],
         "experiment": row["experiment"],
         "quantity": row["quantity"],
         "of": row["of"],
         "seeds": row["seeds"],
-        "value [95%]": said(found) + (f" ({reached} reached)" if reached is not None else ""),
-        "at": None if row["at"] is None or math.isnan(row["at"]) else number(row["at"], 3),
+        "value (range) or ratio [95%]": value + came,
+        "at": None if row["at"] is None else number(row["at"], 3),
     }
 
 
@@ -237,8 +357,7 @@ def ablations(results: Results) -> list[dict[str, str]]:
             for ablation in ABLATIONS.values():
                 variants |= ablation.variants
             for text, arm in variants.items():
-                there = (name, arm.name, preset) in kept
-                if not there and preset not in presets(results):
+                if (name, arm.name, preset) not in kept:
                     continue
                 about = {"preset": preset, "experiment": EXPERIMENTS[name].title, "variant": text}
                 rows.append(about | _ablated(results, name, arm, preset))
@@ -246,7 +365,14 @@ def ablations(results: Results) -> list[dict[str, str]]:
 
 
 def _ablated(results: Results, name: str, arm: Arm, preset: str) -> dict[str, str]:
-    columns = ("seeds", "zero shot", "mean on the way", "at the end", "env steps to 20")
+    columns = (
+        "seeds",
+        "zero shot",
+        "mean on the way",
+        "at the end",
+        "M target steps to 20",
+        "never at 20",
+    )
     found = curves_of(results.rows["curves"], name, arm, preset)
     if found is None:
         return dict.fromkeys(columns, NOT_RUN)
@@ -257,13 +383,13 @@ def _ablated(results: Results, name: str, arm: Arm, preset: str) -> dict[str, st
         and row["arm"] == arm.zero_shot
     ]
     times = found.env_steps_to(20.0)
-    reached = f"{int(np.isfinite(times).sum())} of {len(times)}"
     cells = (
         f"{len(times)}",
-        said(estimate(iqm, np.array(looks))) if looks else "-",
-        said(estimate(iqm, found.filled.mean(-1))),
-        said(estimate(iqm, found.last)),
-        f"{said(estimate(middle, times))} ({reached})",
+        spread(mean_of(np.array(looks))) if looks else "-",
+        spread(mean_of(found.filled.mean(-1))),
+        spread(mean_of(found.last)),
+        spread(median_of(times), 3),
+        f"{int(np.isinf(times).sum())} of {len(times)}",
     )
     return dict(zip(columns, cells, strict=True))
 
@@ -285,20 +411,38 @@ def report(results: Results) -> str:
         RULES,
         "## Table I: steps taken at the paper's fixed hour",
         markdown(table_1(results.rows["curves"])),
-        "The paper ran each once. Ours: interquartile mean over seeds, 95% interval.",
+        "The paper ran each once. Ours: mean over seeds (range). Target epochs: scratch's, and the "
+        "transferred arm's after those of its source, which the hours count; `at` is T or the end "
+        "of the shorter budget. Never at 30: seeds from scratch, transferred.",
+        "## Costs",
+        COSTS,
+        "### Steps taken at equal cost",
+        markdown(costs(results)),
+        "### Cost to a number of steps taken",
+        markdown(times(results)),
         "## Table II: seconds per epoch of 20,000 environment steps",
         markdown(table_2(results.rows["seconds_per_epoch"])),
         _speed_note(results.rows["seconds_per_epoch"]),
         "## Figure 2",
-        *(f"![Figure 2, preset {name}](figure2-{name}.png)" for name in presets(results)),
+        "On the paper's axis, its hours, and by environment steps. Lines are means over the seeds, "
+        "bands from the least to the greatest; a transferred policy starts at the cost of its "
+        "source.",
+        *(
+            f"![Figure 2, preset {name}, by {axis.label}]({figure_file(name, axis.name)})"
+            for name in presets(results)
+            for axis in AXES
+        ),
         "## On the way: steps taken from scratch -> after transfer, at equal environment steps",
-        "Counted or not: whether the source's steps count for the transferred policy. Learning "
-        "rates anneal to the end of each budget under preset `fast`.",
+        "Means over the seeds. Counted or not: whether the source's steps count for the "
+        "transferred policy. Learning rates anneal to the end of each budget under preset `fast`.",
         markdown(on_the_way(results.rows["curves"])),
         "## Ablations",
+        "Means over seeds (range); times are medians. What they say: "
+        "[docs/ablations.md](../../docs/ablations.md).",
         markdown(ablations(results)),
         "Further statistics: [statistics.md](statistics.md), [statistics.csv](statistics.csv).",
         "## Budgets",
+        BUDGETS,
         _budgets(results, known),
         "## Commands",
         "As they were given at their commits; the program was `experiments/reproduce_paper.py` "

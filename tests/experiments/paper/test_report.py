@@ -7,7 +7,15 @@ import pytest
 from experiments.paper.claims import NOT_RUN
 from experiments.paper.program import Options, run
 from experiments.paper.published import EXPERIMENTS
-from experiments.paper.report import on_the_way, report, statistics_rows, table_1, table_2
+from experiments.paper.report import (
+    costs,
+    on_the_way,
+    report,
+    seconds_here,
+    table_1,
+    table_2,
+    times,
+)
 from experiments.paper.results import KEY, Results
 
 from .rows import RESULTS, arms
@@ -52,8 +60,9 @@ def test_everything_is_made_again_from_them(kept):
     names = {path.name for path in kept.directory.iterdir()}
     tables = {f"{t}.{end}" for t in ("table1", "table2", "ablations") for end in ("md", "csv")}
     assert names >= tables | {"statistics.csv", "statistics.md", "README.md"}
-    assert (kept.directory / "figure2-fast.png").read_bytes()[:4] == b"\x89PNG"
-    assert "figure2-paper.png" not in names
+    for figure in ("figure2-fast-hours.png", "figure2-fast-env-steps.png", "transfer-fast.png"):
+        assert (kept.directory / figure).read_bytes()[:4] == b"\x89PNG"
+    assert not any("paper" in name for name in names)
     assert ".lock" not in names
     again = report(Results.read(kept.directory))
     assert (kept.directory / "README.md").read_text() == again
@@ -64,7 +73,9 @@ def test_what_is_not_run_says_so(kept):
     assert rows[IC3NET.title, "paper"]["ratio"] == NOT_RUN
     assert rows[EXPERIMENTS["pcp-hetnet-2p1c"].title, "fast"]["transfer"] == NOT_RUN
     ours = rows[IC3NET.title, "fast"]
-    assert ours["scratch"].startswith("174.0 [")  # the mean of both epochs of 199 and 150, ...
+    assert ours["scratch"].startswith(
+        "174.0 (169.0-"
+    )  # the mean of both epochs of 199 and 150, ...
     timed = table_2(kept.rows["seconds_per_epoch"])[2]
     assert timed["paper (s)"] == "143.13 ± 0.51"
     assert timed["ours, fast (s)"] == "0.500 ± 0.010 (286x as fast)"
@@ -77,10 +88,29 @@ def test_both_arms_at_equal_steps(kept):
     assert set(counted.values()) >= {"-"}
 
 
-def test_the_aggregate_is_between_a_random_policy_and_the_bound(kept):
-    scores = [r for r in statistics_rows(kept) if r["quantity"] == "score at the hour"]
-    assert [row["of"] for row in scores] == ["scratch", "transfer"]
-    assert 0 < scores[0]["value"] < scores[1]["value"] < 1
+def test_every_comparison_stands_under_each_accounting(kept):
+    """Minutes only where all three arms were measured."""
+    rows = costs(kept)
+    assert [row["equal"] for row in rows] == ["the paper's hours", "M environment steps"]
+    for arm, seconds in (("source", 0.2), ("transfer", 0.4)):
+        row = {**kept.rows["seconds_per_epoch"][0], "arm": arm, "seconds": seconds}
+        kept.replace("seconds_per_epoch", [row], ("experiment", "arm"))
+    assert costs(kept)[2]["equal"] == "minutes here"
+    (at_30, at_20) = times(kept)
+    assert at_30["never: scratch, transfer"] == "3 of 3, 0 of 3"
+    assert at_30["target alone, M environment steps"].startswith("never (never-never) -> 0.0400")
+    assert at_20["never: scratch, transfer"] == "3 of 3, 1 of 3"
+    assert "not measured" not in at_20.values()
+
+
+def test_a_source_of_two_experiments_is_measured_once():
+    timed = [
+        {"experiment": "pcp-hetnet-2p1c", "arm": "source", "preset": "fast", "seconds": 1.0},
+        {"experiment": "pcp-hetnet-3p2c", "arm": "scratch", "preset": "fast", "seconds": 2.0},
+    ]
+    found = seconds_here(timed)
+    assert found["pcp-hetnet-3p2c", "fast"] == {"source": 1.0, "scratch": 2.0}
+    assert found["pcp-hetnet-2p1c", "fast"] == {"source": 1.0}
 
 
 def test_the_kept_results_are_what_their_files_say(tmp_path):
