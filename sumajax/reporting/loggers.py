@@ -128,13 +128,15 @@ class WeightsAndBiases:
         import wandb
 
         self._known: set[tuple[str, str]] = set()
+        # A sweep says itself which project and which run its trials are.
+        in_sweep, is_named = (f"WANDB_{name}_ID" in os.environ for name in ("SWEEP", "RUN"))
         try:
             self._run = wandb.init(
-                project=os.environ.get("WANDB_PROJECT", "sumajax"),
+                project=None if in_sweep else os.environ.get("WANDB_PROJECT", "sumajax"),
                 name=directory.name,
                 dir=str(directory),
                 config=dict(config),
-                id=_identity(directory / "wandb-id.txt"),
+                id=None if is_named else _identity(directory / "wandb-id.txt"),
                 resume="allow",
             )
         except Exception as error:  # its own, the network's, the login's: there is no common kind

@@ -70,7 +70,8 @@ def runs(monkeypatch):
         return made[-1]
 
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=init))
-    monkeypatch.delenv("WANDB_PROJECT", raising=False)
+    for name in ("WANDB_PROJECT", "WANDB_RUN_ID", "WANDB_SWEEP_ID"):
+        monkeypatch.delenv(name, raising=False)
     return made
 
 
@@ -116,6 +117,16 @@ def test_wandb_is_one_run_that_goes_on(runs, tmp_path):
         "source/mean/*": "source/env_steps",
     }
     assert runs[0].finished
+
+
+def test_wandb_leaves_a_sweeps_trial_its_name_and_project(runs, tmp_path, monkeypatch):
+    """By which the sweep finds its figures; a run that a person names keeps the project."""
+    monkeypatch.setenv("WANDB_RUN_ID", "trial")
+    with Loggers(["wandb"], tmp_path):
+        assert (runs[0].options["id"], runs[0].options["project"]) == (None, "sumajax")
+    monkeypatch.setenv("WANDB_SWEEP_ID", "sweep")
+    with Loggers(["wandb"], tmp_path):
+        assert (runs[1].options["id"], runs[1].options["project"]) == (None, None)
 
 
 def test_wandb_gets_the_mean_over_the_seeds_that_have_a_number(runs, tmp_path):
