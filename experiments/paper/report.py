@@ -36,6 +36,13 @@ from sumajax.reporting import write_text
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 PROVENANCE = "provenance"
 
+KEPT = """\
+[curves.csv](curves.csv) has an epoch of a seed in a row, [evaluations.csv](evaluations.csv) the held-out
+episodes, [references.csv](references.csv) a random team and the shortest paths on the same starts,
+[seconds_per_epoch.csv](seconds_per_epoch.csv) the speed. `tests/experiments/paper/test_recomputed.py`
+works the figures of the README and of the pages in `docs/` out of them once more, without this program.
+Larger grids have rows of their own: [scale](scale/README.md)."""
+
 COSTS = """\
 Three accountings, the source's cost in each: the paper's hours (epochs times its Table II),
 environment steps, and minutes here (epochs times our Table II: one seed alone, one pass, the
@@ -403,8 +410,9 @@ def report(results: Results) -> str:
         by_name.setdefault(claim.name, []).append(claim)
     lines = [
         "# The paper's evidence, reproduced",
-        "Made by `python -m experiments.paper --rebuild` from the CSV files beside it; "
+        "Made by `python -m experiments.paper --rebuild` from the rows that are kept beside it; "
         "nothing in it is written by hand. What was not run says so.",
+        KEPT,
         "## Claim by claim",
         markdown([_line(claim) for group in by_name.values() for claim in group]),
         "### How a verdict is found",

@@ -1,0 +1,515 @@
+"""The figures of README.md and docs/, worked out once more from the kept rows.
+
+Nothing of `experiments.paper` is used, and nothing of the package: rows are read with `csv`, and
+the paper's own figures are typed here from its Tables I and II. A table is found by the mark above
+it, `<!-- recomputed: NAME -->`; a sentence by its words.
+"""
+
+import csv
+import math
+import re
+from collections import defaultdict
+from functools import cache
+
+import numpy as np
+import pytest
+
+from .rows import RESULTS
+
+ROOT = RESULTS.parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+MARK = re.compile(r"<!-- recomputed: ([^>]*?) -->\n\|.*\n\|[-|]*\n((?:\|.*\n)+)")
+
+EXPERIMENTS = ("pp-ic3net", "pp-magic", "pp-hetnet", "pcp-hetnet-2p1c", "pcp-hetnet-3p2c")
+TITLES = {
+    "Predator-Prey, 5, IC3Net": "pp-ic3net",
+    "Predator-Prey, 5, MAGIC": "pp-magic",
+    "Predator-Prey, 5, HetNet": "pp-hetnet",
+    "Predator-Capture-Prey, 2 + 1, HetNet": "pcp-hetnet-2p1c",
+    "Predator-Capture-Prey, 3 + 2, HetNet": "pcp-hetnet-3p2c",
+}
+# Seconds per epoch on the source, after transfer and from scratch (the paper's Table II).
+SECONDS = {
+    "pp-ic3net": (50.03, 132.62, 143.13),
+    "pp-magic": (105.89, 256.24, 313.80),
+    "pp-hetnet": (229.45, 439.49, 580.76),
+    "pcp-hetnet-2p1c": (315.05, 791.37, 784.00),
+    "pcp-hetnet-3p2c": (315.05, 846.94, 835.35),
+}
+HOURS = dict(zip(EXPERIMENTS, (10, 30, 100, 200, 350), strict=True))  # T of the paper's Table I
+EPOCH = 0.02  # millions of environment steps, preset `fast`
+
+
+def read(name):
+    with open(RESULTS / f"{name}.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@cache
+def curves():
+    """(preset, experiment, arm) -> (seeds, epochs) of steps taken, M steps and seconds."""
+    found = defaultdict(lambda: defaultdict(list))
+    for row in read("curves"):
+        key = (row["preset"], row["experiment"], row["arm"])
+        seconds = float(row["seconds"]) / int(row["seeds_at_once"])
+        numbers = (float(row["steps_taken"]), int(row["env_steps"]) / 1e6, seconds)
+        assert int(row["epoch"]) == len(found[key][row["seed"]]) + 1
+        found[key][row["seed"]].append(numbers)
+    return {
+        key: tuple(np.array([seeds[s] for s in sorted(seeds)]).transpose(2, 0, 1))
+        for key, seeds in found.items()
+    }
+
+
+@cache
+def evaluations():
+    """(preset, experiment, arm, mode) -> steps taken and success, each of all seeds."""
+    found = defaultdict(list)
+    for row in read("evaluations"):
+        key = tuple(row[name] for name in ("preset", "experiment", "arm", "mode"))
+        found[key].append((float(row["steps_taken"]), float(row["success"])))
+    return {key: tuple(zip(*values, strict=True)) for key, values in found.items()}
+
+
+def source_of(name):
+    return "pcp-hetnet-2p1c" if name.startswith("pcp") else name
+
+
+def steps_taken(name, arm, preset="fast"):
+    return curves()[preset, name, arm][0]
+
+
+def epochs_to(name, arm, threshold=20, preset="fast"):
+    """Of every seed; infinite for one that never came."""
+    hits = [np.flatnonzero(seed <= threshold) for seed in steps_taken(name, arm, preset)]
+    return np.array([hit[0] + 1 if len(hit) else math.inf for hit in hits])
+
+
+def costs(name, threshold=20):
+    """(scratch, transferred with its source) by accounting, of every seed, under preset `fast`."""
+    here = {(row["experiment"], row["arm"]): float(row["seconds"]) for row in timed()}
+    source = steps_taken(source_of(name), "source").shape[1]
+    scratch, transfer = (
+        epochs_to(name, "scratch", threshold),
+        epochs_to(name, "transfer", threshold),
+    )
+    ours = (here[source_of(name), "source"], here[name, "transfer"], here[name, "scratch"])
+    return {
+        unit: (scratch * epoch[2], source * epoch[0] + transfer * epoch[1])
+        for unit, epoch in (
+            ("steps", (EPOCH,) * 3),
+            ("hours", np.array(SECONDS[name]) / 3600),
+            ("minutes", np.array(ours) / 60),
+        )
+    }
+
+
+def timed():
+    return [row for row in read("seconds_per_epoch") if row["preset"] == "fast"]
+
+
+def median(times):
+    return np.sort(times)[len(times) // 2]
+
+
+def number(value, digits):
+    return "never" if math.isinf(value) else f"{value:.{digits}f}"
+
+
+def of_times(times, digits=2):
+    values = (median(times), min(times), max(times))
+    return "{} ({}-{})".format(*(number(value, digits) for value in values))
+
+
+def of_means(values, digits=1):
+    return f"{np.mean(values):.{digits}f} ({min(values):.{digits}f}-{max(values):.{digits}f})"
+
+
+def never(times):
+    return f"{np.isinf(times).sum()} of {len(times)}"
+
+
+# The tables, a row by its first cell.
+
+
+def main(title):
+    name = TITLES[title]
+    scratch, transfer = epochs_to(name, "scratch"), epochs_to(name, "transfer")
+    cost = costs(name)
+    ends = [evaluations()["fast", name, arm, "sampled"][0] for arm in ("scratch", "transfer")]
+    return [
+        f"{never(scratch)}, {never(transfer)}",
+        of_times(scratch * EPOCH),
+        of_times(transfer * EPOCH),
+        of_times(cost["steps"][1]),
+        " → ".join(of_times(times, 1) for times in cost["hours"]),
+        " → ".join(of_times(times) for times in cost["minutes"]),
+        " → ".join(map(of_means, ends)),
+    ]
+
+
+ABLATED = {
+    "transferred, as in the paper": ("transfer", "zero-shot"),
+    "from scratch": ("scratch", None),
+    "(a) source state in a corner of the large one, zeros around": "corner",
+    "(b) an upsampled cell's values sum to one": "mass",
+    "(c) all but the state encoder carried over": "encoder",
+    "(d) the optimiser's memory too": "optimiser",
+    "(e) source trained for half its steps": "50",
+    "(e) for a quarter": "25",
+    "(f) encoder `lab_gap`, upsampled": "lab-gap",
+    "(f) the same, source not upsampled": "lab-gap-native",
+    "(f) the same from scratch": ("scratch-lab-gap", None),
+}
+
+
+def ablated(name, words):
+    """Of an ablation's row: its arm, and that of its zero shot."""
+    arms = ABLATED[words]
+    arm, zero_shot = (f"transfer-{arms}", f"zero-shot-{arms}") if isinstance(arms, str) else arms
+    if name == "pp-hetnet" and arm in ("transfer", "scratch"):
+        return f"{arm}-brief", zero_shot and f"{zero_shot}-brief"
+    return arm, zero_shot
+
+
+def last_tenth(taken):
+    return taken[:, -(taken.shape[1] // 10) :].mean(1)
+
+
+def ablations(name):
+    def row(words):
+        arm, zero_shot = ablated(name, words)
+        taken, times = steps_taken(name, arm), epochs_to(name, arm) * EPOCH
+        looks = evaluations()["fast", name, zero_shot, "sampled"][0] if zero_shot else ()
+        return [
+            f"{len(taken)}",
+            of_means(looks) if looks else "-",
+            of_means(taken.mean(1)),
+            of_times(times),
+            never(times),
+            of_means(last_tenth(taken)),
+        ]
+
+    return row
+
+
+def short_source(epochs):
+    """Means of ten epochs, of scratch at as many steps as the transferred arm has had."""
+    epochs = int(epochs)
+    taken, steps, _ = curves()["paper", "pp-ic3net", "transfer-25"]
+    other, other_steps, _ = curves()["paper", "pp-ic3net", "scratch"]
+    source = curves()["paper", "pp-ic3net", "source-25"][1][:, -1].mean()
+    alone = steps.mean(0)[epochs - 1]
+
+    def scratch(at):
+        had = (other_steps.mean(0) <= at + 1e-9).sum()
+        return of_means(other[:, had - 10 : had].mean(1))
+
+    return [
+        of_means(taken[:, epochs - 10 : epochs].mean(1)),
+        f"{alone:.2f}",
+        scratch(alone),
+        f"{alone + source:.2f}",
+        scratch(alone + source),
+    ]
+
+
+ARMS = {"zero shot": "zero-shot", "transferred": "transfer", "from scratch": "scratch"}
+
+
+def evaluated(name):
+    def row(words, budget):
+        arm = ARMS.get(words, "source")
+        whole = steps_taken(name, "transfer").shape[1] * EPOCH
+        if arm in ("transfer", "scratch") and budget != f"{whole:.1f} M":
+            arm += "-brief"
+        return evaluated_cells(name, arm)
+
+    return row
+
+
+def capture(words, _):
+    task, _, arm = words.removeprefix("10x10, ").partition(": ")
+    name = {"2P/1C": "pcp-hetnet-2p1c", "3P/2C": "pcp-hetnet-3p2c"}.get(task, "pcp-hetnet-2p1c")
+    return evaluated_cells(name, ARMS.get(arm, "source"))
+
+
+def evaluated_cells(name, arm):
+    cells = []
+    for mode in ("sampled", "greedy"):
+        taken, success = evaluations()["fast", name, arm, mode]
+        cells += [of_means(taken), f"{np.mean(success):.3f}"]
+    steps = 0.0
+    if not arm.startswith("zero-shot"):
+        steps = steps_taken(name, arm).shape[1] * EPOCH
+    return [f"{steps:.1f} M" if steps else "0", *cells]
+
+
+TABLES = {
+    "main": main,
+    "ablations pp-ic3net": ablations("pp-ic3net"),
+    "ablations pp-hetnet": ablations("pp-hetnet"),
+    "short source": short_source,
+    "evaluations pp-ic3net": evaluated("pp-ic3net"),
+    "evaluations pp-magic": evaluated("pp-magic"),
+    "evaluations pp-hetnet": evaluated("pp-hetnet"),
+    "evaluations pcp": capture,
+}
+
+
+def tables(text):
+    """Name -> the cells of each row."""
+    return {
+        name: [[cell.strip() for cell in line[1:-1].split("|")] for line in body.splitlines()]
+        for name, body in MARK.findall(text)
+    }
+
+
+def differences(name, rows):
+    """What a table says that the kept rows do not."""
+    found = []
+    for first, *cells in rows:
+        by_budget = name.startswith("evaluations")
+        right = TABLES[name](first, cells[0]) if by_budget else TABLES[name](first)
+        found += [
+            (first, said, ours) for said, ours in zip(cells, right, strict=True) if said != ours
+        ]
+    return found
+
+
+def marked():
+    return {name: rows for page in PAGES for name, rows in tables(page.read_text()).items()}
+
+
+def test_every_table_is_found():
+    """With the rows that it is to have."""
+    assert {name: len(rows) for name, rows in marked().items()} == {
+        "main": 5,
+        "ablations pp-ic3net": 11,
+        "ablations pp-hetnet": 11,
+        "short source": 3,
+        "evaluations pp-ic3net": 4,
+        "evaluations pp-magic": 4,
+        "evaluations pp-hetnet": 6,
+        "evaluations pcp": 7,
+    }
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_is_what_the_kept_rows_say(name):
+    assert differences(name, marked()[name]) == []
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_figure_that_is_altered_is_found(name):
+    """In any cell with a figure; what names a row is not one."""
+    for i, row in enumerate(marked()[name]):
+        for j, cell in enumerate(row[1:], start=1):
+            digits = list(re.finditer(r"\d", cell))
+            if not digits or (name.startswith("evaluations") and j == 1):
+                continue
+            last = digits[-1].start()
+            altered = cell[:last] + str((int(cell[last]) + 1) % 10) + cell[last + 1 :]
+            rows = [list(r) for r in marked()[name]]
+            rows[i][j] = altered
+            assert differences(name, rows), (row[0], cell, altered)
+
+
+def by_rows(of):
+    """A number of every experiment, least and greatest."""
+    values = [of(name) for name in EXPERIMENTS]
+    return min(values), max(values)
+
+
+def ratio(name, unit):
+    scratch, transfer = (median(times) for times in costs(name)[unit])
+    return scratch / transfer
+
+
+def apart(name, unit):
+    scratch, transfer = costs(name)[unit]
+    return max(transfer) < min(scratch) or max(scratch) < min(transfer)
+
+
+def sentences_of_the_readme():
+    minutes = by_rows(lambda name: curves()["paper", name, "scratch"][2][:, -1].mean() / 60)
+    levels = [row for row in read("references") if row["task"] == "target"]
+    random, paths = (
+        [float(row[column]) for row in levels]
+        for column in ("random_steps_taken", "shortest_paths")
+    )
+    alone = by_rows(
+        lambda name: median(epochs_to(name, "scratch")) / median(epochs_to(name, "transfer"))
+    )
+    ends = {
+        name: [
+            np.mean(evaluations()["fast", name, a, "sampled"][0]) for a in ("scratch", "transfer")
+        ]
+        for name in EXPERIMENTS[:3]
+    }
+    apart_at_the_end = math.ceil(10 * max(abs(a - b) for a, b in ends.values())) / 10
+    pp, pcp = ([ratio(n, "steps") for n in part] for part in (EXPERIMENTS[:3], EXPERIMENTS[3:]))
+    assert f"{min(pcp):.1f}" == f"{max(pcp):.1f}" == "1.3"
+    assert not any(apart(name, "steps") for name in EXPERIMENTS[3:])
+    assert [apart(name, "hours") for name in EXPERIMENTS] == [False, False, True, True, True]
+    hours, here = (by_rows(lambda name, u=unit: ratio(name, u)) for unit in ("hours", "minutes"))
+    came = [np.isfinite(epochs_to(name, "scratch", 30)) for name in EXPERIMENTS[2:]]
+    late = np.isinf([epochs_to(name, "scratch") for name in EXPERIMENTS[3:]])
+    assert late.sum() == 1
+    scratch, transfer = (
+        evaluations()["fast", "pcp-hetnet-3p2c", arm, "sampled"][0]
+        for arm in ("scratch", "transfer")
+    )
+    assert max(transfer) < min(scratch)
+    budgets = [steps_taken(name, "scratch").shape[1] * EPOCH for name in EXPERIMENTS]
+    source = {steps_taken(source_of(name), "source").shape for name in EXPERIMENTS}
+    assert source == {(5, 50)}
+    assert len({f"{budget:.1f}" for budget in budgets[2:]}) == 1
+    return [
+        f"{min(HOURS.values())} to {max(HOURS.values())} hours on four processes, take "
+        f"{minutes[0]:.0f} to {minutes[1]:.0f} minutes a seed",
+        f"{50 * EPOCH:.1f} M environment steps on 5x5, then {budgets[0]:.1f} M (IC3Net), "
+        f"{budgets[1]:.1f} M (MAGIC) or {budgets[2]:.1f} M (HetNet) on 10x10",
+        f"A random team takes {min(random):.0f} to {max(random):.0f}, shortest paths "
+        f"{min(paths):.1f} to {max(paths):.1f}",
+        f"in {alone[0]:.1f} to {alone[1]:.0f} times fewer environment steps",
+        f"within {apart_at_the_end:.1f} steps of each other on Predator-Prey",
+        f"scratch needs {min(pp):.2f} to {max(pp):.2f} times the environment steps, on "
+        f"Predator-Capture-Prey {pcp[0]:.1f} times (ranges overlap)",
+        f"Scratch takes {hours[0]:.1f} to {hours[1]:.1f} times the paper's hours",
+        f"{here[0]:.2f} to {here[1]:.1f} times the minutes here",
+        f"{np.sum(came)} of {np.size(came)} such seeds come to 30 steps",
+    ]
+
+
+def sentences_of_the_ablations():
+    def way(name, words):
+        return f"{steps_taken(name, ablated(name, words)[0]).mean():.1f}"
+
+    def zero_shot(name, words):
+        return f"{np.mean(evaluations()['fast', name, ablated(name, words)[1], 'sampled'][0]):.0f}"
+
+    def whole(name, words, source):
+        return f"{median(epochs_to(name, ablated(name, words)[0])) * EPOCH + source:.2f} M"
+
+    first, scratch, corner, *_, quarter, pooled, native, _ = ABLATED
+    ic3, het = "pp-ic3net", "pp-hetnet"
+
+    def overlap(name, words, other, of=lambda taken: taken.mean(1)):
+        one, two = (of(steps_taken(name, ablated(name, w)[0])) for w in (words, other))
+        return max(one) >= min(two) and max(two) >= min(one)
+
+    assert [overlap(name, corner, first) for name in (ic3, het)] == [True, False]
+    assert [overlap(name, pooled, native) for name in (ic3, het)] == [False, False]
+    for name in (ic3, het):
+        end = last_tenth(steps_taken(name, ablated(name, first)[0])).mean()
+        for words in ABLATED:
+            arm = ablated(name, words)[0]
+            if arm.startswith("transfer") and "lab-gap" not in arm:
+                assert last_tenth(steps_taken(name, arm)).mean() <= 1.1 * end
+        short = 12 + epochs_to(name, ablated(name, quarter)[0])
+        assert max(short) >= min(epochs_to(name, ablated(name, scratch)[0]))
+    assert np.isinf(epochs_to(het, "scratch-lab-gap", 30)).all()
+    return [
+        f"a policy starts the target at {zero_shot(ic3, corner)} (IC3Net) and "
+        f"{zero_shot(het, corner)} steps (HetNet) where an upsampled one starts at "
+        f"{zero_shot(ic3, first)} and {zero_shot(het, first)}",
+        f"The mean on the way is {way(ic3, corner)} against {way(ic3, first)} for IC3Net, whose "
+        f"ranges overlap, and {way(het, corner)} against {way(het, first)} for HetNet, whose do "
+        f"not; from scratch it is {way(ic3, scratch)} and {way(het, scratch)}",
+        f"({zero_shot(ic3, pooled)} against {zero_shot(ic3, native)} and {zero_shot(het, pooled)} "
+        f"against {zero_shot(het, native)} steps)",
+        f"gains too, {way(ic3, pooled)} against {way(ic3, native)} (IC3Net) and "
+        f"{way(het, pooled)} against {way(het, native)} (HetNet), ranges apart",
+        *(
+            f"{whole(name, quarter, 12 * EPOCH)} against {whole(name, first, 50 * EPOCH)}{middle}"
+            f"{whole(name, scratch, 0)}{end}"
+            for name, middle, end in (
+                (ic3, " after a whole source and ", " from scratch (IC3Net)"),
+                (het, " and ", " (HetNet)"),
+            )
+        ),
+        f"with the source's {curves()['paper', ic3, 'source-25'][1][:, -1].mean():.1f} M counted",
+    ]
+
+
+def plain(text):
+    return re.sub(r"\s+", " ", text)
+
+
+@pytest.mark.parametrize(
+    ("page", "sentences"),
+    [("README.md", sentences_of_the_readme), ("docs/ablations.md", sentences_of_the_ablations)],
+)
+def test_a_sentence_is_what_the_kept_rows_say(page, sentences):
+    text = plain((ROOT / page).read_text())
+    for sentence in sentences():
+        assert sentence in text, sentence
+
+
+def test_the_readme_has_no_other_figure():
+    """Of what it reaches: each number with a decimal stands in a table or a sentence above."""
+    text = (ROOT / "README.md").read_text()
+    reaches = plain(MARK.sub("", text.partition("## What it reaches")[2].partition("\n## ")[0]))
+    for sentence in sentences_of_the_readme():
+        reaches = reaches.replace(sentence, "")
+    assert re.findall(r"\d+\.\d+|\d+ of \d+|\d+ (?:hours|minutes)", reaches) == []
+
+
+# The report's own tables.
+
+
+def at_the_hour(name, preset):
+    """The hour that is compared, and both arms in the hour before it."""
+    source, transfer, scratch = (
+        steps_taken(source_of(name) if arm == "source" else name, arm, preset)
+        for arm in ("source", "transfer", "scratch")
+    )
+    seconds = np.array(SECONDS[name]) / 3600
+    ends = seconds[2] * np.arange(1, scratch.shape[1] + 1)
+    later = source.shape[1] * seconds[0] + seconds[1] * np.arange(1, transfer.shape[1] + 1)
+    hour = float(HOURS[name])
+    for cost, epoch in ((ends, seconds[2]), (later, seconds[1])):
+        if cost[-1] + epoch <= HOURS[name]:
+            hour = min(hour, cost[-1])
+
+    def mean(taken, cost):
+        return taken[:, (cost > hour - 1 + 1e-9) & (cost <= hour + 1e-9)].mean(1)
+
+    return hour, mean(scratch, ends), mean(transfer, later)
+
+
+def four(value):
+    return f"{value:#.4g}".rstrip(".")
+
+
+def of_seeds(sample):
+    if len(sample) == 1:
+        return four(sample[0])
+    return f"{four(sample.mean())} ({four(sample.min())}-{four(sample.max())})"
+
+
+def test_table_1_of_the_report():
+    rows = read("table1")
+    assert len(rows) == 10
+    names = [name for name in EXPERIMENTS for _ in range(2)]
+    for name, row in zip(names, rows, strict=True):
+        hour, scratch, transfer = at_the_hour(name, row["preset"])
+        assert row["at (h)"] == f"{hour:.3g}"
+        assert row["scratch"] == of_seeds(scratch)
+        assert row["transfer"] == of_seeds(transfer)
+        value, *interval = re.findall(r"[\d.]+", row["ratio"])
+        assert value == four(scratch.mean() / transfer.mean())
+        reached = [
+            np.isfinite(epochs_to(name, arm, 30, row["preset"])) for arm in ("scratch", "transfer")
+        ]
+        of_one_kind = all(r.all() or not r.any() for r in reached)
+        assert bool(interval) == (of_one_kind and min(len(scratch), len(transfer)) >= 3)
+        if interval:
+            logs = [np.log(sample) for sample in (scratch, transfer)]
+            error = math.sqrt(sum(log.var(ddof=1) / len(log) for log in logs))
+            # Student's 97.5% with two and with four degrees of freedom, from a table.
+            half = {3: 4.302653, 5: 2.776445}[len(scratch)] * error
+            middle = logs[0].mean() - logs[1].mean()
+            expected = [four(math.exp(middle + side * half)) for side in (-1, 1)]
+            assert [four(float(end)) for end in interval] == expected
