@@ -4,7 +4,7 @@ Agents pass the mean of each other's hidden states through a dense layer into a 
 IC3Net each agent also decides, by a gate sampled one step ahead, whether it takes part at all.
 """
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import chex
 import jax
@@ -20,6 +20,9 @@ from sumajax.records import exportable
 
 SILENT, TALK = 0, 1
 
+Message = Literal["mean", "talking", "max"]
+"""What an agent hears of the others, see `heard_by_all`."""
+
 
 @exportable
 @struct.dataclass
@@ -34,7 +37,8 @@ class IC3NetCarry:
 class IC3NetCore(nn.Module):
     """One step from encoded observations: messages, LSTM, heads.
 
-    Source: Singh et al. 2019 and its program; docs/reference/policies.md, IC3Net.
+    Source: Singh et al. 2019 and its program; docs/reference/policies.md, IC3Net. Another `message`
+    than the mean is this package's.
     """
 
     hidden: int
@@ -42,6 +46,7 @@ class IC3NetCore(nn.Module):
     communicates: bool = True
     gated: bool = True
     comm_passes: int = 1
+    message: Message = "mean"
 
     def setup(self) -> None:
         passes = self.comm_passes if self.communicates else 0
@@ -58,7 +63,7 @@ class IC3NetCore(nn.Module):
         """x (..., N, H), alive (..., N) -> h, s, logits by decision, value (..., N)."""
         h, s = carry.h, carry.s
         for message_layer in self.C:
-            heard = mean_message(h, carry.gate, alive)
+            heard = heard_by_all(self.message, h, carry.gate, alive)
             h, s = self.lstm((h, s), x + message_layer(heard))
         if not self.communicates:
             h, s = self.lstm((h, s), x)
@@ -66,6 +71,24 @@ class IC3NetCore(nn.Module):
         action, value, *gate = side_by_side(heads, h)
         logits = {"action": action} | ({"gate": gate[0]} if gate else {})
         return h, s, logits, value[..., 0]
+
+
+def heard_by_all(
+    message: Message, h: chex.Array, gate: chex.Array, alive: chex.Array | None
+) -> chex.Array:
+    """(..., N, H): what each agent hears of h (..., N, H), gates (..., N).
+
+    * `mean`: the published mean over all others, `mean_message`. One voice that knows something is
+      half of it in a team of 3 and a ninth in a team of 10.
+    * `talking`: the mean over the others who talk, `talking_message`.
+    * `max`: feature by feature the largest of those who talk, `max_message`. What one voice says
+      stands out however large the team is.
+
+    In all of them a silent agent neither speaks nor hears.
+    """
+    return {"mean": mean_message, "talking": talking_message, "max": max_message}[message](
+        h, gate, alive
+    )
 
 
 def mean_message(h: chex.Array, gate: chex.Array, alive: chex.Array | None = None) -> chex.Array:
@@ -78,6 +101,51 @@ def mean_message(h: chex.Array, gate: chex.Array, alive: chex.Array | None = Non
     gate, others = talking(gate, alive), count_others(gate, alive)
     spoken = gate[..., None] * h
     return gate[..., None] * (spoken.sum(-2, keepdims=True) - spoken) / others
+
+
+def talking_message(h: chex.Array, gate: chex.Array, alive: chex.Array | None) -> chex.Array:
+    """(..., N, H): what each agent hears, the mean of h over the others who talk; 0 without any."""
+    gate = talking(gate, alive)
+    spoken = gate[..., None] * h
+    total = spoken.sum(-2, keepdims=True) - spoken
+    return gate[..., None] * total / count_talking(gate)[..., None]
+
+
+def max_message(h: chex.Array, gate: chex.Array, alive: chex.Array | None) -> chex.Array:
+    """(..., N, H): what each agent hears, the largest h of all who talk, itself included."""
+    gate = talking(gate, alive)
+    talks = jnp.broadcast_to(gate[..., None], h.shape) > 0
+    # h lies between -1 and 1, so -1 is no louder than anybody; the gate clears a silent team's.
+    loudest = jnp.where(talks, h, jnp.asarray(-1, h.dtype)).max(-2, keepdims=True)
+    return gate[..., None] * loudest
+
+
+def count_talking(gate: chex.Array) -> chex.Array:
+    """(..., N): how many others talk, at least 1, of gates (..., N) closed for who is not there."""
+    return jnp.maximum(gate.sum(-1, keepdims=True) - gate, 1)
+
+
+def weights_of_senders(
+    message: Message, h: chex.Array, gate: chex.Array, alive: chex.Array | None
+) -> chex.Array:
+    """(..., N, N): the share that each sender (column) has in what each receiver (row) hears.
+
+    Of `max` the share of the features in which it is the loudest.
+
+    Args:
+      h: (..., N, H) what is said; gate: (..., N) closed for who is not there.
+    """
+    pairs = gate[..., :, None] * gate[..., None, :]
+    if message == "max":
+        talks = jnp.broadcast_to(gate[..., None], h.shape) > 0
+        loud = jnp.where(talks, h, jnp.asarray(-1, h.dtype))
+        loudest = (loud == loud.max(-2, keepdims=True)).astype(h.dtype)
+        share = (loudest / loudest.sum(-2, keepdims=True)).mean(-1)  # of features that tie, a part
+        return pairs * share[..., None, :]
+    pairs = pairs * lift(1 - jnp.eye(gate.shape[-1], dtype=pairs.dtype), pairs.ndim)
+    if message == "talking":
+        return pairs / count_talking(gate)[..., None]
+    return pairs / count_others(gate, alive)
 
 
 def talking(gate: chex.Array, alive: chex.Array | None) -> chex.Array:
@@ -97,6 +165,8 @@ class IC3Net(PolicyModule):
 
     Attributes:
       comm_passes: rounds of messages within a step.
+      message: what is heard of the others: the published `mean` over all of them, or, for large
+        teams, the mean over those `talking` or the `max`, see `heard_by_all`.
       talk_always: the gate is drawn and trained as ever, but taken as open from the second step on,
         as the published program does in Traffic Junction.
       fresh_memory: an agent that takes another's place starts without its memory; in the published
@@ -110,6 +180,7 @@ class IC3Net(PolicyModule):
     encoder: EncoderKind = "flat"
     talk_always: bool = False
     fresh_memory: bool = False
+    message: Message = "mean"
 
     critic_parameters: ClassVar[frozenset[str]] = frozenset({"value"})
 
@@ -121,6 +192,7 @@ class IC3Net(PolicyModule):
             self.communicates,
             self.gated,
             self.comm_passes,
+            self.message,
         )
 
     def encode_states(self, states: chex.Array | SparseStates) -> chex.Array:
@@ -147,14 +219,11 @@ class IC3Net(PolicyModule):
             decisions["gate"] = decide(logits["gate"], noise["gate"])
             gate = decisions["gate"].choice.astype(h.dtype)
             gate = jnp.ones_like(gate) if self.talk_always else gate
-        num_agents = h.shape[-2]
-        pairs = talked[..., :, None] * talked[..., None, :]
-        pairs = pairs * lift(1 - jnp.eye(num_agents, dtype=pairs.dtype), pairs.ndim)
         output = PolicyOutput(
             decisions=decisions,
             value=value,
             communication=talked,
-            attention=pairs / count_others(talked, alive),
+            attention=weights_of_senders(self.message, carry.h, talked, alive),
         )
         return IC3NetCarry(h, s, gate), output
 

@@ -7,7 +7,15 @@ import pytest
 
 from sumajax.environments import PredatorPrey
 from sumajax.policies import make_policy
-from sumajax.policies.ic3net import IC3NetCarry, IC3NetCore, mean_message
+from sumajax.policies.ic3net import (
+    IC3NetCarry,
+    IC3NetCore,
+    heard_by_all,
+    max_message,
+    mean_message,
+    talking_message,
+    weights_of_senders,
+)
 
 from .teams import PREY_THREE, greedy, listener, observe, parameters, size, small, stepper
 
@@ -53,6 +61,73 @@ def test_a_message_is_the_mean_over_all_others_not_over_those_who_talk():
         mean_message(h, jnp.array([1.0, 1.0, 0.0])), [[1, 10], [0.5, 5], [0, 0]]
     )
     np.testing.assert_allclose(mean_message(h, jnp.ones(3))[2], [1.5, 15])
+
+
+SAID = jnp.array([[0.1, 0.6], [0.2, -0.5], [0.4, 0.9]])
+MESSAGES = ("mean", "talking", "max")
+
+
+def test_on_request_a_message_is_the_mean_over_those_who_talk():
+    two = talking_message(SAID, jnp.array([1.0, 1.0, 0.0]), None)
+    np.testing.assert_allclose(two, [[0.2, -0.5], [0.1, 0.6], [0, 0]], rtol=1e-6)
+    all_talk = jnp.ones(3)
+    np.testing.assert_allclose(
+        talking_message(SAID, all_talk, None), mean_message(SAID, all_talk, None), rtol=1e-6
+    )
+    alone = talking_message(SAID, jnp.array([1.0, 0.0, 0.0]), None)
+    np.testing.assert_array_equal(alone, np.zeros_like(SAID))
+
+
+def test_on_request_a_message_is_the_largest_of_those_who_talk():
+    all_talk = max_message(SAID, jnp.ones(3), None)
+    np.testing.assert_allclose(all_talk, [[0.4, 0.9]] * 3)
+    two = max_message(SAID, jnp.array([1.0, 1.0, 0.0]), None)
+    np.testing.assert_allclose(two, [[0.2, 0.6], [0.2, 0.6], [0, 0]])
+    np.testing.assert_array_equal(max_message(SAID, jnp.zeros(3), None), np.zeros_like(SAID))
+
+
+def test_who_is_not_there_is_no_voice_of_any_message():
+    there, gone = jnp.array([True, True, False]), jnp.array([1.0, 1.0, 0.0])
+    for message in MESSAGES[1:]:
+        np.testing.assert_array_equal(
+            heard_by_all(message, SAID, jnp.ones(3), there), heard_by_all(message, SAID, gone, None)
+        )
+
+
+@pytest.mark.parametrize(("message", "kept"), [("mean", 1 / 9), ("talking", 1.0), ("max", 1.0)])
+def test_how_much_of_one_voice_is_left_in_a_team_of_ten(message, kept):
+    """The first agent talks and says 0.5; of the others, who say nothing, the last one listens."""
+    gate = jnp.zeros(10).at[jnp.array([0, 9])].set(1.0)
+    said = jnp.zeros((10, 1)).at[0].set(0.5)
+    heard = heard_by_all(message, said, gate, None)
+    np.testing.assert_allclose(heard[9], [0.5 * kept], rtol=1e-6)
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+def test_attention_is_each_senders_share_in_what_is_heard(message):
+    gate = jnp.array([1.0, 1.0, 0.0])
+    weights = weights_of_senders(message, SAID, gate, None)
+    expected = {
+        "mean": [[0, 0.5, 0], [0.5, 0, 0], [0, 0, 0]],
+        "talking": [[0, 1, 0], [1, 0, 0], [0, 0, 0]],
+        "max": [[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 0]],
+    }[message]
+    np.testing.assert_allclose(weights, expected)
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+def test_the_policy_hears_what_its_setting_says(message):
+    heard = listener(small("ic3net", message=message), steps=2)(
+        observe(PREY_THREE, 0), gate=[1, 0, 1]
+    )
+    np.testing.assert_array_equal(heard, [[1, 0, 1], [0, 1, 0], [1, 0, 1]])
+
+
+def test_the_kind_of_message_changes_no_parameter():
+    published, other = (
+        jax.eval_shape(small("ic3net", message=m).init, jax.random.key(0)) for m in ("mean", "max")
+    )
+    assert published == other
 
 
 def test_one_agent_alone_hears_nothing():
