@@ -23,6 +23,7 @@ from sumajax.cli.domains import (
 from sumajax.cli.options import chosen_preset, keep_compiled, parse, plain_errors
 from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
 from sumajax.environments.roads import Difficulty
+from sumajax.environments.traffic_junction import with_curriculum
 from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES
 from sumajax.experiment.directory import plain
@@ -173,6 +174,10 @@ class TransferOptions:
         own = {task.shape: task.max_steps for task in (self.source, self.target)}
         return own.get(size, step_limit(size))
 
+    def taught(self, task: Any, epochs: int) -> Any:
+        """A stage's task as it is in a training of so many epochs."""
+        return task
+
     def experiment(self) -> Experiment:
         """The plan that these options say.
 
@@ -180,7 +185,9 @@ class TransferOptions:
           ValueError: for options that do not go together.
         """
         names, epochs = _names(self), _epochs(self)
-        envs = [_seen(self, task, place) for place, task in enumerate(self.tasks)]
+        lengths = [*epochs, *epochs[-1:] * (len(self.tasks) - len(epochs))]
+        taught = map(self.taught, self.tasks, lengths)
+        envs = [_seen(self, task, place) for place, task in enumerate(taught)]
         scratch = self.scratch and len(epochs) == len(envs) and len(envs) > 1
         scratch_epochs = epochs[-1] if self.scratch_epochs is None else self.scratch_epochs
         first = 0 if self.source_checkpoint is None else 1
@@ -270,6 +277,11 @@ class TJTransfer(TransferOptions):
     """Cars of each stage, how many there can be at once; those of its difficulty if not given."""
     max_steps: tuple[int, ...] = ()
     """Step limit of each stage; that of its difficulty if not given."""
+    curriculum: bool = True
+    """Let each stage's arrival rate rise as in IC3Net's runs, to that of the task, between an
+    eighth and five eighths of its epochs. What is evaluated has the task's rate throughout."""
+    source_epochs: int = 60
+    """Epochs of 20,000 environment steps on the source task."""
     threshold: float = 0.8
     """Success that counts as solved in the comparison."""
 
@@ -300,6 +312,10 @@ class TJTransfer(TransferOptions):
 
     def limit(self, place: int, size: tuple[int, int]) -> int:
         return self.like(place).max_steps
+
+    def taught(self, task: TrafficJunction, epochs: int) -> TrafficJunction:
+        """At rates that rise, with --curriculum."""
+        return with_curriculum(task, epochs) if self.curriculum else task
 
 
 OPTIONS: dict[str, type[TransferOptions]] = {

@@ -13,7 +13,7 @@ of `TrafficJunction` only call them.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, ClassVar, Literal, get_args
 
@@ -232,6 +232,11 @@ PUBLISHED: dict[Difficulty, dict[str, Any]] = {
 }
 """Sizes and step limits of IC3Net's commands, and the constant rates of MAGIC's."""
 
+FIRST_RATES: dict[Difficulty, float] = {"easy": 0.1, "medium": 0.05, "hard": 0.02}
+"""Where the rates of IC3Net's commands begin; they rise to those above."""
+RISE = (1 / 8, 5 / 8)
+"""The part of a training in which they rise: epochs 250 to 1250 of 2000."""
+
 
 def reset(
     env: TrafficJunction, key: chex.PRNGKey, arrival_rate: chex.Numeric | None = None
@@ -267,6 +272,23 @@ def reset_in_epoch(env: TrafficJunction, key: chex.PRNGKey, epoch: chex.Numeric)
         return reset(env, key)
     table = rate_table(env)
     return reset(env, key, jnp.asarray(table)[jnp.clip(epoch, 0, len(table) - 1)])
+
+
+def with_curriculum(env: TrafficJunction, epochs: int) -> TrafficJunction:
+    """`env` with a rate that rises over a training of so many epochs as IC3Net's do.
+
+    A task whose rate rises already, or begins no higher than the published rate does, stays as it
+    is.
+    """
+    first = FIRST_RATES[env.difficulty]
+    if env.final_arrival_rate is not None or env.arrival_rate <= first:
+        return env
+    return replace(
+        env,
+        arrival_rate=first,
+        final_arrival_rate=env.arrival_rate,
+        rate_epochs=(int(RISE[0] * epochs), int(RISE[1] * epochs)),
+    )
 
 
 @cache

@@ -19,7 +19,9 @@ def options(text="", policy="ic3net"):
     return parse(transfer.TJTransfer, default, text.split())
 
 
-def stages(text):
+def stages(text, curriculum=False):
+    """By name, as evaluated: without a curriculum unless asked for."""
+    text = text if curriculum else f"{text} --no-curriculum"
     return {stage.name: stage.env for stage in options(text).experiment().stages}
 
 
@@ -71,6 +73,27 @@ def test_a_stage_has_the_settings_of_the_task_of_its_difficulty():
     source = TrafficJunction(arrival_rate=0.1, final_arrival_rate=0.3, rate_epochs=(5, 15))
     assert given["source"] == StateUpsampled(source, 14)
     assert given["transfer"].arrival_rate == 0.1
+
+
+def test_rates_rise_as_published_unless_they_are_not_to():
+    """0.1 to 0.3 and 0.05 to 0.2, from an eighth to five eighths of a stage."""
+    taught = stages("--source-epochs 80 --target-epochs 40", curriculum=True)
+    easy = TrafficJunction(arrival_rate=0.1, final_arrival_rate=0.3, rate_epochs=(10, 50))
+    rising = {"arrival_rate": 0.05, "final_arrival_rate": 0.2, "rate_epochs": (5, 25)}
+    medium = TrafficJunction("medium", **rising)
+    assert taught == {
+        "source": StateUpsampled(easy, 14),
+        "transfer": medium,
+        "scratch": medium,
+    }
+
+
+def test_a_rate_that_was_given_to_rise_does_as_given():
+    given = "--source.arrival-rate 0.05 --source.final-arrival-rate 0.1 --target.arrival-rate 0.04"
+    taught = stages(given, curriculum=True)
+    assert taught["source"].env.rate_epochs == (250, 1250)
+    assert taught["source"].arrival_rate == 0.05
+    assert not taught["transfer"].rises  # it is lower than where the published one begins
 
 
 @pytest.mark.parametrize(
