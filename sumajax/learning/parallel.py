@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,9 @@ from sumajax.learning.learner import Learner, Metrics, TrainState
 SEEDS, ENVS = "seeds", "envs"
 
 Train = Callable[[TrainState], tuple[TrainState, Metrics]]
+
+PROGRAMS_KEPT = 32
+"""Of each kind in a process: a stage that goes on, or one like another, traces nothing again."""
 
 
 @dataclass(frozen=True)
@@ -225,18 +228,27 @@ def make_mesh(num_seeds: int, num_envs: int, devices: int) -> Mesh:
 
 def init_seeds(learner: Learner, seeds: list[int]) -> TrainState:
     """A fresh training state per seed, stacked along a leading axis."""
-    return jax.jit(jax.vmap(learner.init))(seed_keys(seeds))
+    return _init_all(learner)(seed_keys(seeds))
+
+
+@lru_cache(PROGRAMS_KEPT)
+def _init_all(learner: Learner) -> Callable[[chex.PRNGKey], TrainState]:
+    return jax.jit(jax.vmap(learner.init))
 
 
 def init_seeds_from(
     learner: Learner, seeds: list[int], params: Any, opt_state: Any = None
 ) -> TrainState:
     """The start of training from given parameters, leaves (S, ...), per seed."""
+    return _init_all_from(learner)(params, opt_state, seed_keys(seeds))
 
+
+@lru_cache(PROGRAMS_KEPT)
+def _init_all_from(learner: Learner) -> Callable[[Any, Any, chex.PRNGKey], TrainState]:
     def of_one(params: Any, opt_state: Any, key: chex.PRNGKey) -> TrainState:
         return learner.init_from(params, jax.random.split(key)[1], opt_state)
 
-    return jax.jit(jax.vmap(of_one))(params, opt_state, seed_keys(seeds))
+    return jax.jit(jax.vmap(of_one))
 
 
 def seed_keys(seeds: list[int]) -> chex.PRNGKey:
@@ -244,6 +256,7 @@ def seed_keys(seeds: list[int]) -> chex.PRNGKey:
     return jnp.stack([key_of(seed) for seed in seeds])
 
 
+@lru_cache(PROGRAMS_KEPT)
 def make_train(
     learner: Learner, mesh: Mesh, epochs: int, execution: Execution | None = None
 ) -> Train:

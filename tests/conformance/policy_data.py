@@ -63,11 +63,12 @@ def case_free(name: str) -> str:
 
 @lru_cache(maxsize=64)
 def answer(path: Path, dtype: type) -> Arrays:
-    """Our value of every recorded result, computed in `dtype`."""
+    """Our value of every recorded result, computed in `dtype` by one program for the file."""
+    given = load(path)
+    real = {k: v.astype(dtype) for k, v in given.items() if v.dtype.kind == "f"}
     with jax.enable_x64(dtype == np.float64):
-        fields = {k: jnp.asarray(v, dtype) for k, v in load(path).items() if v.dtype.kind == "f"}
-        fields = load(path) | fields
-        return jax.tree.map(np.asarray, answering(path)(fields))
+        answers = jax.jit(lambda real: answering(path)(given | real))(real)
+        return jax.tree.map(np.asarray, answers)
 
 
 def answering(path: Path) -> Callable[[Arrays], Arrays]:
@@ -133,7 +134,7 @@ def answer_tarmac_gradient(fields: Arrays) -> Arrays:
         given = {k: v for k, v in named.items() if f"in.cot_{k}" in fields}
         return sum((fields[f"in.cot_{k}"] * out[v]).sum() for k, v in given.items()), out
 
-    run = jax.jit(jax.value_and_grad(weighed, (0, 1), has_aux=True))
+    run = jax.value_and_grad(weighed, (0, 1), has_aux=True)
     (scalar, out), (params, x) = run(nested(fields, "param."), fields["in.x"])
     return out | dotted(params, "grad.") | {"grad.x": x, "out.scalar": scalar}
 
@@ -269,7 +270,7 @@ def answer_attention(fields: Arrays) -> Arrays:
 
         inputs = {"m": case["in.m"], "graph": case["in.graph"], "param": nested(case, "param.")}
         inputs["graph"] = jnp.asarray(inputs["graph"], inputs["m"].dtype)
-        y, pull_back = jax.vjp(jax.jit(output), inputs)
+        y, pull_back = jax.vjp(output, inputs)
         (gradient,) = pull_back(jnp.asarray(case["in.cotangent"], y.dtype))
         gradient |= gradient.pop("param")
         answers |= {f"c{n}.out.y": y, **{f"c{n}.grad.{k}": v for k, v in gradient.items()}}
@@ -302,13 +303,9 @@ def hetnet_step(fields: Arrays, inputs: Arrays, settings: Arrays, n_p: int, n_a:
     f_a = inputs.get("feat_A", jnp.zeros((*f_p.shape[:-2], 0, widths[1]), f_p.dtype))
     noise = forcing(inputs["bits"], f_p.dtype) if "bits" in inputs else None
 
-    @jax.jit
-    def run(params, f_p, f_a, meta, noise):
-        result, seen = graph.apply(params, f_p, f_a, meta, noise, capture_intermediates=True)
-        return hetnet_results(result, seen["intermediates"], n_p, n_a)
-
-    params = {"params": hetnet_parameters(fields)}
-    return run(params, f_p, f_a, jnp.asarray(fields["in.feat_S"]), noise)
+    params, meta = {"params": hetnet_parameters(fields)}, fields["in.feat_S"]
+    result, seen = graph.apply(params, f_p, f_a, meta, noise, capture_intermediates=True)
+    return hetnet_results(result, seen["intermediates"], n_p, n_a)
 
 
 def hetnet_sequence_step(
@@ -369,11 +366,7 @@ def unroll(step: Callable, start: Any, inputs: Any, reset: np.ndarray) -> Arrays
     def swap(tree):
         return jax.tree.map(lambda y: jnp.swapaxes(y, 0, 1), tree)
 
-    @jax.jit
-    def run(start, inputs):
-        return jax.lax.scan(one_step, start, swap(inputs))[1]
-
-    return swap(run(start, (*inputs, jnp.asarray(reset))))
+    return swap(jax.lax.scan(one_step, start, swap((*inputs, jnp.asarray(reset))))[1])
 
 
 def forcing(bits: jax.Array, dtype: Any) -> jax.Array:

@@ -267,7 +267,7 @@ def update_results(learner: RecordedLearner, state: TrainState) -> tuple[TrainSt
     """The state after an update, and its `out.*` and `grad.*` (`grad.x` of the whole file)."""
     results = batch_results(learner, state.params)
     next_state, tally = learner.update(state.replace(actors=learner.given[0]))
-    grads = jax.tree.map(lambda g: g / tally.env_steps, learner.gradients.pop()["params"])
+    grads = jax.tree.map(lambda g: g / tally.env_steps, learner.gradients.pop()["policy"]["params"])
     results |= data.dotted(grads["core"], "grad.") | {"grad.x": grads["observation"]["x"]}
     return next_state.replace(actors=None), results
 
@@ -276,9 +276,7 @@ def update_results(learner: RecordedLearner, state: TrainState) -> tuple[TrainSt
 def answer(path: Path, dtype: Any) -> Arrays:
     """Every result of a file, computed in `dtype`: `u1.out.*`, `u1.grad.*`, `p1.*`, and so on."""
     with jax.enable_x64(dtype == np.float64):
-        fields = {
-            k: jnp.asarray(v, dtype) for k, v in data.load(path).items() if v.dtype.kind == "f"
-        }
+        fields = {k: v.astype(dtype) for k, v in data.load(path).items() if v.dtype.kind == "f"}
         fields = data.load(path) | fields
         published = {"RMSPROP_DECAY": "cfg.alpha", "RMSPROP_EPS": "cfg.eps"}
         with mock.patch.multiple(optimiser, **{k: float(fields[v]) for k, v in published.items()}):
@@ -289,21 +287,25 @@ def answer_updates(fields: Arrays, dtype: Any) -> Arrays:
     updates = [part(fields, k + 1) for k in range(int(fields["cfg.n_updates"]))]
     env, policy = recorded_task(fields, updates)
     learner = RecordedLearner(env, policy, settings(fields))
-    x = jnp.concatenate([update["in.x"] for update in updates])
+    x = np.concatenate([update["in.x"] for update in updates])
     params = {"params": {"core": data.nested(fields, "p0."), "observation": {"x": x}}}
     state = TrainState(
         params=params,
-        opt_state=optimiser.make_optimiser(learner.config).init(params),
+        opt_state=jax.jit(optimiser.make_optimiser(learner.config).init)(params),
         actors=None,
         key=None,
-        updates=jnp.int32(0),
+        updates=np.int32(0),
     )
+
+    def answered(update, first, state):
+        given = recorded_inputs(policy, update, first, dtype)
+        return update_results(replace(learner, given=given), state)
+
     results, first = {}, 0
     for k, update in enumerate(updates, start=1):
         end = first + len(update["in.x"])
-        learner = replace(learner, given=recorded_inputs(policy, update, first, dtype))
-        state, answers = jax.jit(partial(update_results, learner))(state)
-        answers["grad.x"] = answers["grad.x"][first:end]
+        state, answers = jax.jit(partial(answered, update, first))(state)
+        answers["grad.x"] = np.asarray(answers["grad.x"])[first:end]
         results |= {f"u{k}.{name}": y for name, y in answers.items()}
         results |= data.dotted(state.params["params"]["core"], f"p{k}.")
         first = end

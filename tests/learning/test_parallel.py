@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,17 @@ from trajectories import TINY_TASK, tiny_learner
 from sumajax.learning import parallel
 
 SEEDS = [0, 5]
+
+COMPILED = "/jax/core/compile/backend_compile_duration"
+events = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, seconds, **_: events.append(event) if event == COMPILED else None
+)
+
+
+def programs_compiled():
+    """Or read from the cache of compiled programs, in this process so far."""
+    return len(events)
 
 
 def raw(leaf):
@@ -54,6 +66,24 @@ def test_seeds_side_by_side_learn_what_they_learn_one_after_the_other(policy):
     jax.tree.map(close, *jax.tree.map(raw, [states.params for states, _ in ways]))
     for name in ("env_steps", "steps_taken", "success", "entropy", "value_loss", "gradient_norm"):
         np.testing.assert_allclose(*(getattr(figures, name) for _, figures in ways), rtol=1e-3)
+
+
+def test_a_stage_like_an_earlier_one_is_traced_no_second_time():
+    """Nor one that goes on after a stop: equal learners have the same functions."""
+    first, equal, other = (
+        tiny_learner(replace(TINY_TASK, max_steps=n), num_envs=200, rollout_length=20)
+        for n in (5, 5, 6)
+    )
+    mesh, anew = (parallel.make_mesh(1, 200, devices=1) for _ in range(2))
+    train = parallel.make_train(first, mesh, 1)
+    assert parallel.make_train(equal, anew, 1) is train
+    assert parallel.make_train(equal, mesh, 2) is not train
+    assert parallel.make_train(other, mesh, 1) is not train
+    for learner, compiled in ((first, 1), (equal, 0), (other, 1)):
+        before = programs_compiled()
+        states = jax.eval_shape(partial(parallel.init_seeds, learner, [0]))
+        parallel.compile_train(learner, mesh, 1, states)
+        assert programs_compiled() - before == compiled
 
 
 def test_seeds_side_by_side_share_every_product():
