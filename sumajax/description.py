@@ -27,8 +27,8 @@ from sumajax.upsampling import StateUpsampled
 MAX_SETTING, MAX_CELLS = 10_000, 10_000_000
 """Whole numbers, and cells of the grid, of a task or policy that is built from a file."""
 
-POOLED_ENCODERS = ("lab_gap",)
-"""Encoders that pool over the grid: their parameters fit any."""
+POOLED_ENCODERS = ("lab_gap", "coordinates")
+"""Encoders that pool over the grid, or read shares of it: their parameters fit any."""
 
 _LINEN_FIELDS = ("parent", "name")
 """Of every module; they say where it stands in another, not what it is."""
@@ -143,6 +143,7 @@ def check_compatible(
     directory: str | os.PathLike[str] = "the checkpoint",
     *,
     here: str = "this stage",
+    any_grid: bool = False,
 ) -> None:
     """Whether the parameters of a checkpoint fit `policy` on `env`; team sizes may differ.
 
@@ -150,6 +151,7 @@ def check_compatible(
       meta: of the checkpoint, from `describe`.
       directory: of the checkpoint, for the sentence.
       here: what `env` and `policy` are of, for the sentence.
+      any_grid: the position table is going to be resized, the grids may differ.
 
     Raises:
       CheckpointError: for the first of policy, its settings, vision, observation channels, number
@@ -157,7 +159,7 @@ def check_compatible(
     """
     try:
         saved, settings = dict(meta), dict(meta["policy"]["settings"])
-        pairs = list(_compared(saved, settings, env, policy))
+        pairs = list(_compared(saved, settings, env, policy, any_grid))
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise CheckpointError(
             f"{directory} does not say which task and policy it is of; save it with meta from "
@@ -171,7 +173,11 @@ def check_compatible(
 
 
 def _compared(
-    saved: dict[str, Any], settings: dict[str, Any], env: Environment, policy: Policy
+    saved: dict[str, Any],
+    settings: dict[str, Any],
+    env: Environment,
+    policy: Policy,
+    any_grid: bool,
 ) -> Iterator[tuple[str, Any, Any, str]]:
     """(what, saved value, value here, mend) in the order in which they are worth knowing."""
     yield "policy", saved["policy"]["name"], policy.name, "use one policy in both"
@@ -199,7 +205,7 @@ def _compared(
         env.num_actions,
         "use tasks with the same actions in both",
     )
-    if _settings(policy).get("encoder") in POOLED_ENCODERS:
+    if any_grid or _settings(policy).get("encoder") in POOLED_ENCODERS:
         return
     yield (
         "the policy's grid",

@@ -5,9 +5,10 @@ checkpoints from which it goes on when it is started again, and from which a tar
 Of several hosts (`sumajax.hosts`) the first alone has files; all train.
 """
 
+import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from sumajax.checkpoint import CheckpointError
 from sumajax.learning import parallel
 from sumajax.learning.guard import FAULTS
 from sumajax.learning.learner import Learner, Metrics, TrainState
-from sumajax.sources import source_of
+from sumajax.policies.encoder import Resize, resized_table, table_grid
+from sumajax.sources import Source, source_of
 
 CHUNK = 5
 """Epochs of a compiled call: between two looks at the metrics, and between two checkpoints."""
@@ -34,7 +36,10 @@ class StageRun:
 
     Attributes:
       arm: its name in the files.
+      epochs: it has at most.
       directory: of its checkpoints.
+      looked_at: after every so many epochs something is asked of it, `ended` of `run_stage`; what
+        a compiled call trains ends there.
     """
 
     arm: str
@@ -42,6 +47,7 @@ class StageRun:
     epochs: int
     seeds: tuple[int, ...]
     directory: Path
+    looked_at: int | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,7 @@ class StageResult:
     first_epoch: int  # epochs that an earlier run had done
     compile_seconds: float
     train_seconds: float
+    epoch: int  # that it came to
     stops: tuple[Stop, ...] = ()  # seeds whose last state is of an earlier epoch
 
 
@@ -84,7 +91,7 @@ class Chunk:
     metrics: Metrics  # leaves (seeds, epochs of the chunk)
     seconds: float  # wall time of the chunk
     compile_seconds: float = 0.0  # before it
-    cpu_seconds: float = 0.0  # user and system time of the process since the stage began
+    cpu_seconds: float = 0.0  # user and system time of the process in the chunk's training alone
 
 
 def fresh_states(stage: StageRun) -> TrainState:
@@ -98,6 +105,7 @@ def transferred_states(
     *,
     carry_optimiser: bool = False,
     leave_out: tuple[str, ...] = (),
+    resize: Resize | None = None,
 ) -> TrainState:
     """States that start from the parameters in the checkpoints of another stage.
 
@@ -109,13 +117,15 @@ def transferred_states(
       source: of the stage's checkpoints, or of a run, whose last stage is meant; or the name of a
         trained policy of the package.
       leave_out: modules of the policy whose parameters stay fresh, as `state_encoder`.
+      resize: how the state encoder's position table comes from the source's grid to this stage's;
+        None: the policy has one grid in both.
 
     Raises:
       CheckpointError: as for `saved_parts`.
       ValueError: for a module that the policy does not have.
     """
     fresh = fresh_states(stage)
-    saved = saved_parts(stage, source, carry_optimiser=carry_optimiser)
+    saved = saved_parts(stage, source, carry_optimiser=carry_optimiser, resize=resize)
     carried = {
         field: jax.tree.map(
             lambda x, y: jnp.broadcast_to(jnp.asarray(x), y.shape), part, getattr(fresh, field)
@@ -141,7 +151,13 @@ def _without(params: Any, fresh: Any, modules: tuple[str, ...]) -> Any:
     )
 
 
-def saved_parts(stage: StageRun, source: Path, *, carry_optimiser: bool = False) -> dict[str, Any]:
+def saved_parts(
+    stage: StageRun,
+    source: Path,
+    *,
+    carry_optimiser: bool = False,
+    resize: Resize | None = None,
+) -> dict[str, Any]:
     """What `stage` would take over from `source`, by field of its states; compiles nothing.
 
     Raises:
@@ -149,8 +165,8 @@ def saved_parts(stage: StageRun, source: Path, *, carry_optimiser: bool = False)
         setting or the leaf and both values.
     """
     found, learner = source_of(source), stage.learner
-    meta = found.meta
-    checkpoint.check_compatible(meta, learner.env, learner.policy, found.name)
+    meta, any_grid = found.meta, resize is not None
+    checkpoint.check_compatible(meta, learner.env, learner.policy, found.name, any_grid=any_grid)
     saved_seeds = meta.get("seeds", [0])
     by_number = set(stage.seeds) <= set(saved_seeds)
     if not by_number and len(saved_seeds) != 1:
@@ -163,11 +179,44 @@ def saved_parts(stage: StageRun, source: Path, *, carry_optimiser: bool = False)
         jax.eval_shape(lambda: fresh_states(stage)),
     )
     fields = ("params", "opt_state") if carry_optimiser else ("params",)
-    saved = {field: found.load(getattr(like, field), field) for field in fields}
+    if resize is None:
+        saved = {field: found.load(getattr(like, field), field) for field in fields}
+    else:
+        saved = {"params": _resized(found, learner, like.params, resize)}
     if not by_number:
         return saved
     places = np.array([saved_seeds.index(seed) for seed in stage.seeds])
     return jax.tree.map(lambda x: x[places], saved)
+
+
+def _resized(found: Source, learner: Learner, like: Any, method: Resize) -> Any:
+    """The parameters of a source, with the position table brought to the learner's grid.
+
+    Args:
+      like: shapes of the parameters here, leaves (seeds, ...).
+    """
+    kind: Any = getattr(learner.policy.module, "encoder", None)
+    before = table_grid(kind, tuple(found.meta["state_shape"]))
+    after = table_grid(kind, learner.policy.team.state_shape)
+
+    def as_saved(path: Any, x: Any) -> Any:
+        shape = (x.shape[0], math.prod(before), x.shape[2]) if _is_table(path) else x.shape
+        return jax.ShapeDtypeStruct(shape, x.dtype)
+
+    def brought(path: Any, x: Any) -> Any:
+        return resized_table(x, before, after, method) if _is_table(path) else x
+
+    by_path = jax.tree_util.tree_map_with_path
+    return by_path(brought, found.load(by_path(as_saved, like)))
+
+
+def _is_table(path: Any) -> bool:
+    """Whether a leaf of a policy's parameters is the state encoder's position table."""
+    return tuple(getattr(key, "key", None) for key in path[-3:]) == (
+        "state_encoder",
+        "dense",
+        "kernel",
+    )
 
 
 def untrained_parameters(
@@ -208,6 +257,7 @@ def run_stage(
     on_resume: Callable[[int], None] = lambda epoch: None,
     stop_asked: Callable[[], bool] = lambda: False,
     on_stop: Callable[[Stop], None] = lambda stop: None,
+    ended: Callable[[int, tuple[Stop, ...]], bool] = lambda epoch, stops: False,
     chunk: int = CHUNK,
 ) -> StageResult:
     """Trains the stage to its end, from its last checkpoint if it has one, else from `start()`.
@@ -220,15 +270,16 @@ def run_stage(
       on_resume: called first with the epoch that training goes on from.
       stop_asked: called after every checkpoint; True stops there, with a KeyboardInterrupt.
       on_stop: called once for each seed that stops; the others go on.
+      ended: asked after every checkpoint, and of the one that training goes on from, with its epoch
+        and the seeds that have stopped; True ends the stage there, before its last epoch.
 
-    Every host calls this with the same stage; only the first one's `start` and `stop_asked` are
-    called, and only it touches the directory.
+    Every host calls this with the same stage; only the first one's `start`, `stop_asked` and
+    `ended` are called, and only it touches the directory.
 
     Raises:
       StoppedError: when the last seed has stopped; its checkpoint is written.
       HostError: on the other hosts, what went wrong on the first.
     """
-    began = time.process_time()
     num_seeds, num_envs = len(stage.seeds), stage.learner.config.num_envs
     mesh = mesh or parallel.make_mesh(num_seeds, num_envs, 1)
     about: dict[str, Any] = {"arm": stage.arm, "seeds": list(stage.seeds), **(meta or {})}
@@ -239,8 +290,10 @@ def run_stage(
     states = parallel.place(whole, mesh)
     compile_seconds = train_seconds = 0.0
     chunks = _chunks(stage, mesh, states, first_epoch, chunk)
-    while len(stops) < num_seeds and (news := next(chunks, None)) is not None:
-        news = replace(news, cpu_seconds=time.process_time() - began)
+    epoch, over = first_epoch, False
+    if first_epoch:
+        over = hosts.first_does(lambda: ended(first_epoch, stops))
+    while len(stops) < num_seeds and not over and (news := next(chunks, None)) is not None:
         whole = news.states
         compile_seconds += news.compile_seconds
         train_seconds += news.seconds
@@ -251,12 +304,14 @@ def run_stage(
         meta_now = {**description, "epoch": news.epoch, "stops": [asdict(stop) for stop in stops]}
         if hosts.first_does(partial(_save, stage, whole, meta_now, stop_asked)):
             raise KeyboardInterrupt
+        epoch = news.epoch
+        over = hosts.first_does(partial(ended, epoch, stops))
     if len(stops) == num_seeds:
         raise StoppedError(
             f"no seed of the {stage.arm} stage is left ({stops[0]}); try a lower learning rate or "
             "max_grad_norm in another directory."
         )
-    return StageResult(whole, first_epoch, compile_seconds, train_seconds, stops)
+    return StageResult(whole, first_epoch, compile_seconds, train_seconds, epoch, stops)
 
 
 def _begin(
@@ -289,18 +344,19 @@ def _chunks(
     stage: StageRun, mesh: Mesh, states: TrainState, first_epoch: int, longest: int
 ) -> Iterator[Chunk]:
     """Trains from `first_epoch` to the stage's end; compiles when the first chunk is asked for."""
-    length = _chunk_length(stage.epochs, first_epoch, longest)
+    length = _chunk_length(stage.epochs, first_epoch, longest, stage.looked_at)
     train: parallel.Train | None = None
     for epoch in range(first_epoch, stage.epochs, length):
         began = time.perf_counter()
         train = train or parallel.compile_train(stage.learner, mesh, length, states)
         compiled = time.perf_counter()
         hosts.meet()
-        met = time.perf_counter()
+        met, cpu = time.perf_counter(), time.process_time()
         states, metrics = jax.block_until_ready(train(states))
-        seconds = time.perf_counter() - met
+        seconds, cpu_seconds = time.perf_counter() - met, time.process_time() - cpu
         whole, news = hosts.gathered((states, metrics))
-        yield Chunk(epoch, epoch + length, whole, jax.device_get(news), seconds, compiled - began)
+        news = jax.device_get(news)
+        yield Chunk(epoch, epoch + length, whole, news, seconds, compiled - began, cpu_seconds)
 
 
 def _new_stops(stage: StageRun, news: Chunk, known: tuple[Stop, ...]) -> list[Stop]:
@@ -337,13 +393,15 @@ def _resumed(
     return resumed, jax.tree.map(jnp.asarray, states)
 
 
-def _chunk_length(epochs: int, done: int, longest: int) -> int:
-    """The longest chunk that reaches the end in equal parts, so that one program is compiled.
+def _chunk_length(epochs: int, done: int, longest: int, looked_at: int | None = None) -> int:
+    """The longest chunk that reaches the end, and every epoch at which the stage is `looked_at`, in
+    equal parts, so that one program is compiled.
 
     A resumed stage takes the chunks of an uninterrupted one: other chunks are other programs, and
     look at the policy in other epochs.
     """
     for left in (epochs, epochs - done):
+        left = math.gcd(left, looked_at or left)
         length = max((n for n in range(1, longest + 1) if left % n == 0), default=1)
         if done % length == 0:
             return length

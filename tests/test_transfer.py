@@ -252,3 +252,48 @@ class TestUntrainedParameters:
         assert len(between) == 8  # weights and attention of both layers
         # One sender a relation: its attention is 1, whatever the parameters.
         assert {name.rsplit("_")[-1] for name in set(left) - set(between)} == {"src", "dst"}
+
+
+# --- Another grid: the position table is resized -----------------------------------------------
+
+NATIVE_SOURCE = PredatorPrey(size=3, num_predators=2, max_steps=10)
+
+
+def states_from(native, tmp_path, encoder, resize, **size):
+    trained = stage(native, tmp_path / "small", encoder=encoder)
+    before = fresh_states(trained)
+    checkpoint.save(
+        trained.directory,
+        before,
+        checkpoint.describe(native, trained.learner.policy, seeds=[0, 1], epoch=1),
+    )
+    target = stage(replace(TARGET, **size), tmp_path / "large", encoder=encoder)
+    return before, transferred_states(target, trained.directory, resize=resize)
+
+
+@pytest.mark.parametrize("encoder", ["linear", "flat"])
+def test_a_policy_of_a_small_grid_goes_on_with_a_resized_position_table(tmp_path, encoder):
+    before, after = states_from(NATIVE_SOURCE, tmp_path, encoder, "nearest")
+    small, large = (s.params["params"].pop("observation") for s in (before, after))
+    assert equal(before.params, after.params)
+    kernels = [part["state_encoder"].pop("dense") for part in (small, large)]
+    assert equal(small, large)
+    before, after = (np.asarray(part["kernel"]) for part in kernels)
+    side, channels = (3, 1) if encoder == "linear" else (2, 16)
+    # Of 2 places of the convolutions on 3x3 there are 3 on 6x6, whose middle one is in the second.
+    nearest = [0, 0, 1, 1, 2, 2] if encoder == "linear" else [0, 1, 1]
+    table = before.reshape(2, side, side, channels, -1)[:, nearest][:, :, nearest]
+    np.testing.assert_array_equal(after, table.reshape(after.shape))
+    assert equal(kernels[0]["bias"], kernels[1]["bias"])
+
+
+def test_only_a_resized_table_takes_a_policy_to_another_grid(tmp_path):
+    with pytest.raises(CheckpointError, match="the policy's grid differs: 3x3"):
+        states_from(NATIVE_SOURCE, tmp_path, "linear", None)
+    with pytest.raises(ValueError, match="encoder 'coordinates' has no position table"):
+        states_from(NATIVE_SOURCE, tmp_path / "other", "coordinates", "nearest")
+
+
+def test_coordinates_go_to_any_grid_as_they_are(tmp_path):
+    before, after = states_from(NATIVE_SOURCE, tmp_path, "coordinates", None, size=(5, 7))
+    assert equal(before.params, after.params)

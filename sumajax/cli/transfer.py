@@ -29,6 +29,7 @@ from sumajax.evaluation import EPISODES
 from sumajax.experiment.directory import plain
 from sumajax.experiment.plan import MAX_EPOCHS, Experiment, chain, check_seeds
 from sumajax.experiment.run import Where, run_experiment
+from sumajax.experiment.stillness import Still
 from sumajax.learning import LearnerConfig, parallel, preset
 from sumajax.policies import POLICIES
 from sumajax.policies.encoder import EncoderKind
@@ -81,6 +82,9 @@ class TransferOptions:
     """Also train on the target from scratch."""
     scratch_epochs: int | None = None
     """Epochs from scratch; the target's if not given."""
+    until_still: bool = False
+    """End a stage, but not the one from scratch, when it has stopped improving; its epochs are then
+    the most it may have."""
     source_checkpoint: Path | None = None
     """Checkpoints, or a run, to transfer from, made elsewhere, or the name of a trained policy of
     the package, as pp-5x5-at-10x10-ic3net; the source stage is then left out."""
@@ -90,9 +94,10 @@ class TransferOptions:
     """What upsampling does to the state's mass: none (the paper), or mass (blocks sum to one)."""
     upsampling: Upsampling = "blocks"
     """blocks: the paper's. corner: the small state as it is, zeros around it. none: the small state
-    alone, which only the encoder lab_gap can take to another grid."""
+    alone, which only the encoders lab_gap and coordinates can take to another grid."""
     encoder: EncoderKind = "flat"
-    """How the policy reads the state: flat, lab_gap (pools over the grid) or linear."""
+    """How the policy reads the state: flat, lab_gap (pools over the grid), linear or coordinates
+    (shares of the grid's sides)."""
     carry_optimiser: bool = False
     """Carry the optimiser's memory over with the parameters."""
     leave_out: tuple[str, ...] = ()
@@ -198,6 +203,7 @@ class TransferOptions:
             self.learner,
             start=self.source_checkpoint,
             scratch_epochs=scratch_epochs if scratch else 0,
+            until=Still() if self.until_still else None,
             carry_optimiser=self.carry_optimiser,
             leave_out=self.leave_out,
         )

@@ -2,5 +2,6 @@
 
 from sumajax.experiment.plan import Experiment, Stage, chain
 from sumajax.experiment.run import run_experiment
+from sumajax.experiment.stillness import Still
 
-__all__ = ["Experiment", "Stage", "chain", "run_experiment"]
+__all__ = ["Experiment", "Stage", "Still", "chain", "run_experiment"]

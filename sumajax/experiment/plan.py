@@ -15,9 +15,11 @@ from sumajax import checkpoint
 from sumajax.description import describe_task
 from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES
+from sumajax.experiment.stillness import Still
 from sumajax.learning import LearnerConfig
 from sumajax.learning.scaling import for_stage
 from sumajax.policies import Policy, make_policy
+from sumajax.policies.encoder import Resize
 from sumajax.sources import source_of
 
 MAX_EPOCHS = 100_000
@@ -41,6 +43,12 @@ class Stage:
       learner: its settings; `for_stage` makes of them what is trained here.
       carry_optimiser: take the optimiser's memory over with the parameters.
       leave_out: modules of the policy whose parameters are not taken over, as `state_encoder`.
+      resize: how the state encoder's position table comes from the grid of the stage before to this
+        one's, where the policy sees each task at its own size: `nearest` or `bilinear`.
+      beside: another task that the same policy trains on in the same updates, see `MixedLearner`.
+      until: a rule by which it ends before it has had all its epochs; None: it has them all. What
+        the learner anneals it anneals over all of them, so a stage that ends early ends at the
+        learning rate it has come to.
 
     Raises:
       ValueError: for a name or number of epochs out of range.
@@ -53,6 +61,9 @@ class Stage:
     learner: LearnerConfig = LearnerConfig()
     carry_optimiser: bool = False
     leave_out: tuple[str, ...] = ()
+    resize: Resize | None = None
+    beside: Environment | None = None
+    until: Still | None = None
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -63,6 +74,11 @@ class Stage:
             raise ValueError(
                 f"epochs of stage {self.name} must lie between 1 and {MAX_EPOCHS}, "
                 f"got {self.epochs}."
+            )
+        if self.resize and self.carry_optimiser:
+            raise ValueError(
+                f"stage {self.name} resizes the position table and carries the optimiser's memory, "
+                "which has the old size; leave one of them out."
             )
 
     @property
@@ -87,8 +103,8 @@ class Experiment:
       name, preset: what the files call it.
       threshold: steps taken, or whatever the target names as its merit, that count as solved in the
         comparison.
-      evaluate_every: epochs between held-out evaluations on the way, in every stage but the first
-        of a chain; 0 for none.
+      evaluate_every: epochs between held-out evaluations on the way, in every stage that starts
+        from another or is of the target's task; 0 for none.
       episodes: held-out episodes of an evaluation.
 
     Raises:
@@ -174,7 +190,11 @@ class Experiment:
             if isinstance(stage.start, str):
                 before = self.by_name[stage.start]
                 meta = checkpoint.describe(before.env, self.policy_on(before.env))
-                named = f"the {before.name} stage"
+                named, any_grid = f"the {before.name} stage", stage.resize is not None
+                checkpoint.check_compatible(meta, stage.env, policy, named, any_grid=any_grid)
+            if stage.beside is not None:
+                meta = checkpoint.describe(stage.beside, self.policy_on(stage.beside))
+                named = f"the task beside stage {stage.name}"
                 checkpoint.check_compatible(meta, stage.env, policy, named)
 
 
@@ -218,6 +238,9 @@ def _described(stage: Stage) -> dict[str, Any]:
         "learner": asdict(stage.trained_with),
         "carry_optimiser": stage.carry_optimiser,
         "leave_out": list(stage.leave_out),
+        "resize": stage.resize,
+        "beside": stage.beside and describe_task(stage.beside),
+        "until": stage.until and asdict(stage.until),
     }
 
 
@@ -240,6 +263,7 @@ def chain(
     *,
     start: Path | None = None,
     scratch_epochs: int = 0,
+    until: Still | None = None,
     **carried: Any,
 ) -> tuple[Stage, ...]:
     """Stages that start each from the one before, and a rival that learns the last from scratch.
@@ -248,13 +272,14 @@ def chain(
       envs: each task as the policy sees it, the last one is the target; names, epochs: as many.
       start: checkpoints that the first stage starts from; None: fresh parameters.
       scratch_epochs: of the rival; 0: none.
+      until: the rule by which each of them but the rival may end early.
       carried: `carry_optimiser` and `leave_out` of every stage that starts from another.
     """
     stages: list[Stage] = []
     before: str | Path | None = start
     for env, name, length in zip(envs, names, epochs, strict=True):
         more = {} if before is None else carried
-        stages.append(Stage(name, env, length, before, learner, **more))
+        stages.append(Stage(name, env, length, before, learner, until=until, **more))
         before = name
     if scratch_epochs:
         stages.append(Stage("scratch", envs[-1], scratch_epochs, None, learner))

@@ -22,6 +22,7 @@ from sumajax.experiment.records import MODES, StageRecords, by_seed, held_out, r
 from sumajax.experiment.summary import stage_labels, summarise, table
 from sumajax.keys import key_of
 from sumajax.learning import EPOCH_STEPS, TrainState, make_learner, parallel
+from sumajax.learning.mixed import mixed_with
 from sumajax.policies import Policy
 from sumajax.reporting import metrics as metrics_file
 from sumajax.reporting.loggers import Loggers, check_installed
@@ -29,6 +30,7 @@ from sumajax.transfer import (
     CHUNK,
     Chunk,
     StageRun,
+    Stop,
     fresh_states,
     run_stage,
     saved_epoch,
@@ -101,10 +103,12 @@ class Run:
         begun = checkpoint.latest(self.checkpoints(stage)) is not None
         if isinstance(stage.start, Path) and not begun:
             run, start = self.stage_run(stage), self.start(stage)
-            saved_parts(run, start, carry_optimiser=stage.carry_optimiser)
+            carry = stage.carry_optimiser
+            saved_parts(run, start, carry_optimiser=carry, resize=stage.resize)
 
     def mesh(self, stage: Stage) -> Mesh:
         seeds, envs, where = len(self.experiment.seeds), stage.learner.num_envs, self.where
+        envs = envs if stage.beside is None else envs // 2
         of_each = parallel.choose_devices(seeds, envs, where.devices, where.num_hosts)
         return parallel.make_mesh(seeds, envs, where.num_hosts * of_each)
 
@@ -120,8 +124,16 @@ class Run:
     def stage_run(self, stage: Stage) -> StageRun:
         policy = self.experiment.policy_on(stage.env)
         learner = make_learner(stage.env, policy, stage.trained_with)
-        seeds = self.experiment.seeds
-        return StageRun(stage.name, learner, stage.epochs, seeds, self.checkpoints(stage))
+        if stage.beside is not None:
+            learner = mixed_with(learner, stage.beside)
+        return StageRun(
+            stage.name,
+            learner,
+            stage.epochs,
+            self.experiment.seeds,
+            self.checkpoints(stage),
+            looked_at=None if stage.until is None else stage.until.window,
+        )
 
     def first_states(self, stage: Stage) -> TrainState:
         """What training begins with: fresh, or taken over."""
@@ -132,6 +144,7 @@ class Run:
             self.start(stage),
             carry_optimiser=stage.carry_optimiser,
             leave_out=stage.leave_out,
+            resize=stage.resize,
         )
 
 
@@ -177,12 +190,15 @@ class Recorder:
                 ),
                 on_stop=lambda stop: self.progress.say(f"{stage.name}: {stop}."),
                 stop_asked=asked,
+                ended=partial(self._ended, stage),
                 chunk=run.where.chunk,
             )
+        if result.epoch < stage.epochs:
+            self.progress.say(f"{stage.name}: still after epoch {result.epoch} of {stage.epochs}.")
         cost = self._cost[stage.name]
         arm = metrics_file.arm_summary(
             env_steps=int(cost.env_steps.mean()),
-            epochs=stage.epochs,
+            epochs=result.epoch,
             compile_seconds=result.compile_seconds,
             train_seconds=cost.seconds,
             **self._evaluate(stage, result.states.params),
@@ -258,6 +274,15 @@ class Recorder:
             for mode in MODES
         }
 
+    def _ended(self, stage: Stage, epoch: int, stops: Sequence[Stop]) -> bool:
+        """Whether the stage has stopped improving, if that ends it."""
+        if stage.until is None:
+            return False
+        stopped = {stop.seed for stop in stops}
+        seeds = [seed for seed in self.run.experiment.seeds if seed not in stopped]
+        rows = metrics_file.read_metrics(self.metrics)
+        return stage.until.ends(rows, stage.name, seeds, epoch, stage.env.max_steps)
+
     def _record(self, stage: Stage, stage_run: StageRun, chunk: Chunk) -> None:
         """Rows, a held-out evaluation where one is due, and progress."""
         arm, count, before = stage.name, chunk.epoch - chunk.first_epoch, self._cost[stage.name]
@@ -268,7 +293,8 @@ class Recorder:
         metrics_file.append_rows(self.metrics, rows)
         self.loggers.log(rows)
         experiment = self.run.experiment
-        every = experiment.evaluate_every if stage.env == experiment.target.env else 0
+        begins = stage.start is None and stage.env != experiment.target.env
+        every = 0 if begins else experiment.evaluate_every
         if every and chunk.epoch // every > chunk.first_epoch // every:
             policy, params = stage_run.learner.policy, by_seed(chunk.states.params)
             evaluation = held_out(stage.env, policy, params, experiment.episodes, "sampled")
@@ -320,8 +346,7 @@ class Cost:
 
     env_steps: np.ndarray  # (S,) int
     seconds: float = 0.0  # wall time of training
-    cpu_seconds: float = 0.0  # user and system time of the process since the stage began
-    cpu_before: float = 0.0  # of it, what earlier runs of the stage had used
+    cpu_seconds: float = 0.0  # user and system time of the process, in training
 
     @classmethod
     def so_far(cls, metrics: Path, stage: StageRun) -> "Cost":
@@ -333,21 +358,21 @@ class Cost:
         env_steps = np.array([last[seed]["env_steps"] for seed in stage.seeds], int)
         row = last[stage.seeds[0]]
         cpu = float(np.nan_to_num(row["cpu_seconds"]))  # no number in runs from before it was kept
-        return cls(env_steps, row["seconds"], cpu, cpu)
+        return cls(env_steps, row["seconds"], cpu)
 
     def after(self, chunk: Chunk) -> tuple["Cost", dict[str, np.ndarray]]:
         """The cost after a chunk, and its columns in metrics.csv, epoch by epoch."""
         count = chunk.epoch - chunk.first_epoch
         env_steps = self.env_steps[:, None] + np.cumsum(np.asarray(chunk.metrics.env_steps), -1)
-        cpu_seconds = self.cpu_before + chunk.cpu_seconds
         share = np.arange(1, count + 1) / count
         columns = {
             "env_steps": env_steps,
             "seconds": self.seconds + chunk.seconds * share,
-            "cpu_seconds": self.cpu_seconds + (cpu_seconds - self.cpu_seconds) * share,
+            "cpu_seconds": self.cpu_seconds + chunk.cpu_seconds * share,
         }
         seconds = self.seconds + chunk.seconds
-        return Cost(env_steps[:, -1], seconds, cpu_seconds, self.cpu_before), columns
+        cpu_seconds = self.cpu_seconds + chunk.cpu_seconds
+        return Cost(env_steps[:, -1], seconds, cpu_seconds), columns
 
 
 def _mean(values: np.ndarray) -> float:

@@ -3,12 +3,15 @@
 The paper says only "convolutional and fully-connected layers" (section IV-C), the sizes are this
 package's: docs/reference/policies.md, Encoders. `flat` reads positions exactly because it flattens;
 `lab_gap` is the encoder of the authors' later public branch, which pools over the grid and so
-cannot tell most inner cells of a native grid apart; `linear` has no convolution.
+cannot tell most inner cells of a native grid apart; `linear` has no convolution; `coordinates`
+reads where the state is lit, as a share of the grid's sides, and so is of no grid's size.
 """
 
+import math
 from typing import Any, Literal, get_args
 
 import chex
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
@@ -17,8 +20,9 @@ from sumajax.environments.states import SparseStates
 from sumajax.policies.layers import Dense, lift
 from sumajax.policies.lit_places import lit_places, sum_by_state
 
-EncoderKind = Literal["flat", "lab_gap", "linear"]
+EncoderKind = Literal["flat", "lab_gap", "linear", "coordinates"]
 ENCODERS = get_args(EncoderKind)
+Resize = Literal["nearest", "bilinear"]
 
 STATE_FEATURES = 128
 VIEW_FEATURES = 32
@@ -28,6 +32,13 @@ LIT_PATCHES = 4
 
 The rest of a state is 0: with the whole grid as fan-in, where an agent is changed the features by
 hundredths at first, and one seed in three never learnt Predator-Capture-Prey (docs/settings.md).
+"""
+
+FOURIER_BANDS = 2
+"""Frequencies of `coordinates`: half a turn and a whole one from edge to edge.
+
+On 5x5 neighbours are then a quarter of a turn apart. A third would turn by a half from cell to
+cell: its sine is 0 everywhere on that grid, and its weights would come to a larger one untrained.
 """
 
 
@@ -93,10 +104,12 @@ class StateEncoder(nn.Module):
             self.conv1 = Conv(8, kernel=3, padding="SAME")
             self.conv2 = Conv(16, kernel=3, stride=2, padding="SAME")
             reached = LIT_PATCHES * self.conv2.features
+        elif self.kind == "coordinates":
+            self.dense = Dense(STATE_FEATURES, before_relu=True)
         if self.kind == "lab_gap":
             self.conv1 = Conv(64, kernel=3)
             self.conv2 = Conv(STATE_FEATURES, kernel=2)
-        else:
+        elif self.kind != "coordinates":
             self.dense = Dense(STATE_FEATURES, fan_in=reached, before_relu=True)
 
     def __call__(self, states: chex.Array | SparseStates) -> chex.Array:
@@ -104,6 +117,8 @@ class StateEncoder(nn.Module):
             states = SparseStates.of(states)
         if self.kind == "flat" and isinstance(states, SparseStates):
             return nn.relu(self._known(states))
+        if self.kind == "coordinates":
+            return nn.relu(self.dense(fourier_features(states)))
         if isinstance(states, SparseStates):
             states = states.dense()
         x = jnp.moveaxis(states, -3, -1)
@@ -129,6 +144,90 @@ class StateEncoder(nn.Module):
         kernel, _ = self.dense.weights(empty.size)
         of_place = differs @ kernel.reshape(*differs.shape[::2], -1)  # (P, M, features)
         return background + sum_by_state(of_place, places)
+
+
+# --- What is of no grid's size -----------------------------------------------------------------
+
+
+def lit_centres(states: chex.Array | SparseStates) -> tuple[chex.Array, chex.Array]:
+    """Where states (S, C, rows, columns) are lit.
+
+    Returns:
+      (S, C, 2) row and column of the mean lit cell, 0 at the first and 1 at the last of the grid;
+      (S, C) 1 where anything is lit, else 0.
+    """
+    rows, columns = states.shape[-2:]
+    sides = [np.linspace(0, 1, side, dtype=np.float32) for side in (rows, columns)]
+    if isinstance(states, SparseStates):
+        channel, row, column = states.places()
+        sums = np.zeros((3, len(states), states.shape[0]), np.float32)
+        state = np.arange(len(states))[:, None]
+        weights = (1.0, sides[0][row], sides[1][column])
+        for total, weight in zip(sums, weights, strict=True):
+            np.add.at(total, (state, channel), states.value * weight)
+        mass, *moments = jnp.asarray(sums)
+    else:
+        mass = states.sum((-2, -1))
+        moments = [states.sum(-1) @ sides[0], states.sum(-2) @ sides[1]]
+    lit = (mass > 0).astype(jnp.float32)
+    at = jnp.stack(moments, axis=-1) / (mass + 1 - lit)[..., None]
+    return at, lit
+
+
+def fourier_features(states: chex.Array | SparseStates) -> chex.Array:
+    """(S, C, rows, columns) -> (S, 2 C (1 + 2 FOURIER_BANDS)): where each channel is lit; zeros
+    where it is not.
+
+    Row and column as they are, between -1 and 1, and as sines and cosines (Mildenhall et al. 2020,
+    NeRF, equation 4; Tancik et al. 2020).
+    """
+    at, lit = lit_centres(states)
+    turns = math.pi * 2.0 ** np.arange(FOURIER_BANDS, dtype=np.float32)
+    angle = at[..., None] * turns.astype(np.float32)[None, None, None]
+    features = [2 * at[..., None] - 1, jnp.sin(angle), jnp.cos(angle)]
+    x = jnp.concatenate(features, axis=-1) * lit[..., None, None]
+    return x.reshape(x.shape[0], math.prod(x.shape[1:]))
+
+
+# --- The position table, and another grid ------------------------------------------------------
+
+
+def table_grid(kind: EncoderKind, state_shape: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Rows, columns and channels of the position table: what the kernel of `dense` has a row for.
+
+    Raises:
+      ValueError: for an encoder that has none.
+    """
+    channels, rows, columns = state_shape
+    if kind == "linear":
+        return rows, columns, channels
+    if kind == "flat":
+        return -(-rows // 2), -(-columns // 2), 16
+    raise ValueError(f"encoder {kind!r} has no position table to resize; use 'flat' or 'linear'.")
+
+
+def resized_table(
+    kernel: chex.Array,
+    before: tuple[int, int, int],
+    after: tuple[int, int, int],
+    method: Resize,
+) -> chex.Array:
+    """A position table of one grid for another, as position embeddings of vision transformers are
+    (Dosovitskiy et al. 2021, section 3.2).
+
+    Args:
+      kernel: (S, rows * columns * channels of `before`, F).
+
+    Returns:
+      (S, rows * columns * channels of `after`, F).
+
+    With `linear` and the nearest row it encodes a small state as the small grid did, and a cell of
+    the large grid as the cell of the small one that upsampling makes it a part of.
+    """
+    seeds, _, features = kernel.shape
+    table = jnp.reshape(kernel, (seeds, *before, features))
+    large = jax.image.resize(table, (seeds, *after, features), method)
+    return large.reshape(seeds, math.prod(after), features)
 
 
 class ViewEncoder(nn.Module):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sumajax.environments import PredatorPrey
+from sumajax.environments.states import SparseStates
 from sumajax.policies.encoder import (
     ENCODERS,
     STATE_FEATURES,
@@ -14,6 +15,10 @@ from sumajax.policies.encoder import (
     ObservationEncoder,
     StateEncoder,
     ViewEncoder,
+    fourier_features,
+    lit_centres,
+    resized_table,
+    table_grid,
 )
 from sumajax.upsampling import StateUpsampled
 
@@ -46,7 +51,9 @@ def test_where_an_agent_is_shows_from_the_start_whatever_the_grid(size):
     assert 0.1 < np.mean(spreads) < 0.4
 
 
-@pytest.mark.parametrize(("kind", "native"), [("flat", 100), ("linear", 100), ("lab_gap", 49)])
+@pytest.mark.parametrize(
+    ("kind", "native"), [("flat", 100), ("linear", 100), ("coordinates", 100), ("lab_gap", 49)]
+)
 def test_which_cells_of_a_grid_can_be_told_apart(kind, native):
     """`lab_gap` pools over the grid, so that inner cells look alike on a native 10x10 grid."""
     assert distinct_codes(kind, NATIVE) == native
@@ -119,3 +126,88 @@ def test_observation_is_one_dense_layer_on_state_and_view():
     kernel = jnp.concatenate([parts["merge_state"]["kernel"], parts["merge_view"]["kernel"]])
     expected = jnp.concatenate([s, o], axis=-1) @ kernel + parts["merge_state"]["bias"]
     np.testing.assert_allclose(encoder.apply(params, method=both), expected, atol=1e-5)
+
+
+def test_coordinates_are_shares_of_the_grid_whatever_its_size():
+    """First, middle and last cell of a side have one code each on 5x5, 9x9 and 5x9."""
+    codes = []
+    for rows, columns in ((5, 5), (9, 9), (5, 9)):
+        states = PredatorPrey(size=(rows, columns)).state_table()
+        cells = [r * columns + c for r in (0, rows // 2, rows - 1) for c in (0, columns // 2)]
+        codes.append(fourier_features(states)[np.array(cells)])
+    np.testing.assert_allclose(codes[1], codes[0], atol=1e-6)
+    np.testing.assert_allclose(codes[2], codes[0], atol=1e-6)
+
+
+def test_coordinates_of_a_block_are_those_of_its_middle():
+    at, lit = lit_centres(StateUpsampled(PredatorPrey(size=2, vision=1), 4).state_table())
+    np.testing.assert_allclose(at[:, 0], [[i, j] for i in (1 / 6, 5 / 6) for j in (1 / 6, 5 / 6)])
+    np.testing.assert_array_equal(lit, np.ones((4, 1)))
+
+
+def test_coordinates_of_what_a_task_lists_are_those_of_its_tensors():
+    states = np.asarray(UPSAMPLED)
+    np.testing.assert_allclose(
+        fourier_features(SparseStates.of(states)), fourier_features(jnp.asarray(states)), atol=1e-6
+    )
+
+
+def test_coordinates_of_a_channel_in_which_nothing_is_lit_are_zeros():
+    states = np.zeros((1, 2, 3, 3), np.float32)
+    states[0, 1, 2, 2] = 1.0
+    dark, lit = np.split(np.asarray(fourier_features(jnp.asarray(states)))[0], 2)
+    assert not dark.any()
+    assert lit.any()
+
+
+def test_coordinates_have_the_same_parameters_on_every_grid():
+    shapes = [
+        jax.eval_shape(StateEncoder("coordinates").init, jax.random.key(0), states)
+        for states in (NATIVE, PredatorPrey(size=(3, 7)).state_table())
+    ]
+    assert shapes[0] == shapes[1]
+
+
+def resized(params, kind, before, after, method):
+    kernel = params["params"]["dense"]["kernel"][None]
+    grids = [table_grid(kind, (1, *size)) for size in (before, after)]
+    table = resized_table(kernel, *grids, method)[0]
+    return {"params": {"dense": {**params["params"]["dense"], "kernel": table}}}
+
+
+@pytest.mark.parametrize("size", [(4, 4), (2, 6)])
+def test_nearest_resized_weights_are_upsampling_with_scale_mass(size):
+    """A linear encoder gives a small state, seen upsampled, what the small grid's gave it; and a
+    cell of the large grid what the cell of the small one gave that it is a part of."""
+    small = PredatorPrey(size=2, vision=1)
+    encoder = StateEncoder("linear")
+    code, params = encoder.init_with_output(jax.random.key(0), small.state_table())
+    large = resized(params, "linear", (2, 2), size, "nearest")
+    upsampled = StateUpsampled(small, size, scale="mass").state_table()
+    np.testing.assert_allclose(encoder.apply(large, upsampled), code, rtol=1e-5, atol=1e-7)
+    rows, columns = size
+    native = encoder.apply(large, PredatorPrey(size=size, vision=1).state_table())
+    part_of = [2 * (r * 2 // rows) + c * 2 // columns for r in range(rows) for c in range(columns)]
+    np.testing.assert_array_equal(native, code[np.array(part_of)])
+
+
+def test_bilinear_resized_weights_lie_between_those_of_the_cells_around():
+    kernel = jnp.array([0.0, 1.0, 2.0, 3.0]).reshape(1, 4, 1)  # 2x2: 2 r + c
+    large = resized_table(kernel, (2, 2, 1), (4, 4, 1), "bilinear")[0].reshape(4, 4)
+    np.testing.assert_allclose(large[0], [0, 0.25, 0.75, 1], atol=1e-6)
+    np.testing.assert_allclose(large[:, 0], [0, 0.5, 1.5, 2], atol=1e-6)
+
+
+def test_channels_of_a_place_keep_to_themselves_when_a_table_is_resized():
+    """`flat` has 16 of its second convolution at each place, a quarter as many as cells."""
+    assert table_grid("flat", (1, 5, 10)) == (3, 5, 16)
+    kernel = jnp.broadcast_to(jnp.arange(16.0)[None, :, None], (15, 16, 2)).reshape(1, 240, 2)
+    large = resized_table(kernel, (3, 5, 16), (5, 10, 16), "bilinear").reshape(50, 16, 2)
+    np.testing.assert_allclose(large, jnp.broadcast_to(large[:1], large.shape), atol=1e-5)
+    np.testing.assert_allclose(large[0, :, 0], np.arange(16), atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["lab_gap", "coordinates"])
+def test_an_encoder_of_no_grids_size_has_no_table_to_resize(kind):
+    with pytest.raises(ValueError, match=f"encoder '{kind}' has no position table"):
+        table_grid(kind, (1, 5, 5))

@@ -1,0 +1,1 @@
+"""The study of larger grids and teams behind `python experiments/scale.py`."""

@@ -1,0 +1,177 @@
+"""`python experiments/scale.py`: its options, and what it does with them."""
+
+import json
+import os
+import shlex
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from experiments.paper.results import commit, machine
+from experiments.scaling.plans import PARTS, VARIANTS, Part, Study, studies
+from experiments.scaling.report import write_report
+from experiments.scaling.results import Results
+from experiments.scaling.runs import StudyRun, study_runs
+from sumajax.cli.options import keep_compiled, parse, plain_errors
+from sumajax.cli.transfer import MAX_DEVICES
+from sumajax.description import versions
+from sumajax.evaluation import EPISODES
+from sumajax.experiment.plan import check_seeds
+from sumajax.learning import parallel
+from sumajax.reporting import write_json
+from sumajax.transfer import StoppedError
+
+RESULTS = Path(__file__).parents[1] / "results" / "scale"
+PROVENANCE = "provenance"
+REPLAYED: tuple[Part, ...] = ("pp40", "rect")
+"""Parts of whose first seed an episode is kept, to look at."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Trains chains to large grids, scratch and simpler rivals, and writes what they came to."""
+
+    parts: tuple[Part, ...] = ("pp20",)
+    """pp10, pp20, pp40: Predator-Prey by way of 5x5. pcp20: Predator-Capture-Prey. rect: 10x20 to
+    20x40. rivals: what else makes a small task fit. dilution: policies on large teams. still:
+    stages that end themselves."""
+    policies: tuple[str, ...] = ()
+    """hetnet, ic3net, ic3net-talking, ic3net-max, tarmac-ic3net, magic; each part's own if not
+    given."""
+    only: tuple[str, ...] = ()
+    """Of these parts only the experiments called so, as rivals-blank-hetnet."""
+    seeds: tuple[int, ...] = (0,)
+    """Trained side by side in one run; seeds that are added later have a run of their own."""
+    devices: int = 1
+    """To spread seeds and environments over."""
+    output: Path = RESULTS
+    """Where CSV files, tables and figures are kept."""
+    runs: Path = Path("runs/scale")
+    """Where the run directories with their checkpoints are."""
+    rebuild: bool = False
+    """Train nothing; make tables and figures again from the CSV files in output."""
+
+    def __post_init__(self) -> None:
+        check_seeds(self.seeds)
+        if not 1 <= self.devices <= MAX_DEVICES:
+            raise ValueError(f"devices must lie between 1 and {MAX_DEVICES}, got {self.devices}.")
+        for name, given, known in (
+            ("part", self.parts, PARTS),
+            ("policy", self.policies, tuple(VARIANTS)),
+            ("experiment", self.only, tuple(s.name for s in self._of_parts)),
+        ):
+            for value in given:
+                if value not in known:
+                    raise ValueError(
+                        f"{name} {value!r} is unknown; choose one of {', '.join(known)}."
+                    )
+
+    @property
+    def _of_parts(self) -> list[Study]:
+        known = [part for part in self.parts if part in PARTS]
+        policies = [policy for policy in self.policies if policy in VARIANTS]
+        return [study for part in known for study in studies(part, policies)]
+
+    @property
+    def studies(self) -> list[Study]:
+        return [study for study in self._of_parts if not self.only or study.name in self.only]
+
+
+def run(options: Options, episodes: int = EPISODES) -> None:
+    """Does what the options ask for, and writes every table and figure.
+
+    Args:
+      episodes: held-out episodes of what a stage begins and ends with.
+
+    Raises:
+      ValueError, OSError: one sentence each.
+    """
+    if not options.rebuild:
+        for study in options.studies:
+            for found in study_runs(study, options.seeds, options.runs, options.devices):
+                _finish(found, options, episodes)
+    with locked(options.output):
+        results = Results.read(options.output)
+        if not results.rows["stages"]:
+            raise ValueError(f"{options.output} holds no results; run a part first.")
+        write_report(results)
+    print(f"wrote {options.output / 'tables.md'}")
+
+
+def _finish(found: StudyRun, options: Options, episodes: int) -> None:
+    """Runs what is missing of an experiment and keeps it."""
+    name = f"{found.study.name}, seeds {' '.join(map(str, found.seeds))}"
+    print(f"== {name}", flush=True)
+    _note_session(found, options.output)
+    try:
+        rows = found.finish(episodes)
+    except StoppedError as error:  # no rows then; the others go on
+        print(f"{name}: {error}", flush=True)
+        return
+    with locked(options.output):
+        results = Results.read(options.output)
+        results.add(found.study.name, found.seeds, rows)
+        results.write()
+        replay = found.directory / "replay.gif"
+        if found.study.part in REPLAYED and 0 in found.seeds and replay.exists():
+            shutil.copy(replay, options.output / f"replay-{found.study.name}.gif")
+    _keep_plan(found, options.output)
+
+
+@contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """The kept files, for one program at a time: several may train, each in runs of its own."""
+    directory.mkdir(parents=True, exist_ok=True)
+    with FileLock(directory / ".lock"):
+        yield
+
+
+# --- Where the rows come from ------------------------------------------------------------------
+
+
+def _provenance(found: StudyRun, output: Path) -> Path:
+    return output / PROVENANCE / f"{found.study.name}-{found.directory.name}.json"
+
+
+def _note_session(found: StudyRun, output: Path) -> None:
+    """Adds a session to the run's file, unless the run has ended: command, commit, machine."""
+    file = _provenance(found, output)
+    if found.has_ended and file.exists():
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    before = json.loads(file.read_text()) if file.exists() else {}
+    now = {
+        "command": shlex.join(["python", *sys.argv]),
+        "commit": commit(),
+        "versions": versions(),
+        "machine": machine(),
+        "load_before": os.getloadavg()[0],
+        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+    about = {"experiment": found.study.name, "seeds": found.seeds}
+    write_json(file, {**before, **about, "sessions": [*before.get("sessions", []), now]})
+
+
+def _keep_plan(found: StudyRun, output: Path) -> None:
+    """Adds what was trained, resolved: tasks, starts and every setting of the learner."""
+    file = _provenance(found, output)
+    plan: Any = json.loads((found.directory / "config.json").read_text())["experiment"]
+    write_json(file, {**json.loads(file.read_text()), "plan": plan})
+
+
+def main() -> None:
+    """Reads the options and runs."""
+    with plain_errors():
+        options = parse(Options, Options(), prog="python experiments/scale.py")
+        if not options.rebuild:
+            keep_compiled()
+            # All at once: the experiments share the devices of one program.
+            parallel.choose_devices(options.devices, options.devices, options.devices)
+        run(options)
