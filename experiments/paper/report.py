@@ -37,11 +37,12 @@ PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 PROVENANCE = "provenance"
 
 KEPT = """\
-[curves.csv](curves.csv) has an epoch of a seed in a row, [evaluations.csv](evaluations.csv) the held-out
-episodes, [references.csv](references.csv) a random team and the shortest paths on the same starts,
-[seconds_per_epoch.csv](seconds_per_epoch.csv) the speed. `tests/experiments/paper/test_recomputed.py`
-works the figures of the README and of the pages in `docs/` out of them once more, without this program.
-Larger grids have rows of their own: [scale](scale/README.md)."""
+[curves.csv](curves.csv) has an epoch of a seed in a row, [evaluations.csv](evaluations.csv)
+the held-out episodes, [references.csv](references.csv) a random team and the shortest paths on the
+same starts, [seconds_per_epoch.csv](seconds_per_epoch.csv) the speed.
+`tests/experiments/paper/test_recomputed.py` works the figures of the README and of the pages in
+`docs/` out of them once more, without this program. Larger grids have rows of their own:
+[scale](scale/README.md)."""
 
 COSTS = """\
 Three accountings, the source's cost in each: the paper's hours (epochs times its Table II),
