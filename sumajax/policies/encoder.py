@@ -27,6 +27,8 @@ Resize = Literal["nearest", "bilinear"]
 STATE_FEATURES = 128
 VIEW_FEATURES = 32
 VIEW_KERNEL = 3
+PLACE_CELLS, PLACE_CHANNELS = 2, 16
+"""Cells along a side, and channels, of a place of `flat`'s last convolution."""
 LIT_PATCHES = 4
 """Places of `flat`'s last convolution that one cell reaches at least, whatever the grid's size.
 
@@ -102,14 +104,12 @@ class StateEncoder(nn.Module):
         reached = None
         if self.kind == "flat":
             self.conv1 = Conv(8, kernel=3, padding="SAME")
-            self.conv2 = Conv(16, kernel=3, stride=2, padding="SAME")
+            self.conv2 = Conv(PLACE_CHANNELS, kernel=3, stride=PLACE_CELLS, padding="SAME")
             reached = LIT_PATCHES * self.conv2.features
-        elif self.kind == "coordinates":
-            self.dense = Dense(STATE_FEATURES, before_relu=True)
         if self.kind == "lab_gap":
             self.conv1 = Conv(64, kernel=3)
             self.conv2 = Conv(STATE_FEATURES, kernel=2)
-        elif self.kind != "coordinates":
+        else:
             self.dense = Dense(STATE_FEATURES, fan_in=reached, before_relu=True)
 
     def __call__(self, states: chex.Array | SparseStates) -> chex.Array:
@@ -202,7 +202,7 @@ def table_grid(kind: EncoderKind, state_shape: tuple[int, int, int]) -> tuple[in
     if kind == "linear":
         return rows, columns, channels
     if kind == "flat":
-        return -(-rows // 2), -(-columns // 2), 16
+        return -(-rows // PLACE_CELLS), -(-columns // PLACE_CELLS), PLACE_CHANNELS
     raise ValueError(f"encoder {kind!r} has no position table to resize; use 'flat' or 'linear'.")
 
 

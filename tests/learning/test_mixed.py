@@ -37,9 +37,9 @@ def test_half_of_the_environments_are_of_either_task(state):
 def test_the_gradient_is_the_sum_of_two_learners_and_the_figures_are_of_the_first(state):
     def parts(state):
         actors, draws = MIXED._inputs(state)
-        both = MIXED._gradient(state.params, actors, draws, state.updates)
+        both = MIXED._gradient(MIXED._weights(state), actors, draws, state.updates)
         each = [
-            half._gradient(state.params, *own, state.updates)
+            half._gradient(MIXED._weights(state), *own, 2 * state.updates)
             for half, *own in zip(MIXED.halves, actors, draws, strict=True)
         ]
         return both, each
