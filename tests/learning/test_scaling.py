@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from probes import Probe
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import preset
@@ -50,7 +51,8 @@ class TestHorizon:
     @pytest.mark.parametrize("changes", [{}, {"critic": "state", "scale_by_size": False}])
     def test_otherwise_the_discount_is_that_of_the_preset(self, changes):
         config = preset("fast", **changes)
-        assert for_stage(config, FORTY, 10, transferred=True).gamma == 0.95
+        assert for_stage(config, TWENTY, 10, transferred=True).gamma == 0.95
+        assert for_stage(config, FORTY, 10).gamma == 0.95
 
 
 class TestAfterTransfer:
@@ -65,6 +67,18 @@ class TestAfterTransfer:
         assert config.entropy_weight == pytest.approx(0.004 / 16)
         assert config.value_weight == pytest.approx(0.5 / 16)
         assert config.critic_epochs == 5
+        assert config.critic == "state"
+        assert config.gamma == pytest.approx(0.9875)
+
+    def test_up_to_20x20_the_critic_is_the_policys_own(self):
+        config = after_transfer(preset("fast"), TWENTY)
+        assert config.critic == "policy"
+        assert config.gamma == 0.95
+
+    def test_so_it_is_where_a_task_does_not_say_what_a_critic_is_shown(self):
+        env = Probe(num_agents=5000)
+        assert share_of_reference(env) < 1 / 16
+        assert after_transfer(preset("fast"), env).critic == "policy"
 
     def test_twice_is_the_same_as_once(self):
         once = after_transfer(preset("fast"), FORTY)
