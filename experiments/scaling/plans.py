@@ -22,7 +22,7 @@ from sumajax.upsampling import Fill, Scale, StateUpsampled
 
 PP10_EPOCHS = (40, 125)  # 5x5, 10x10
 PP20_EPOCHS = (40, 40, 60)  # 5x5, 10x10, 20x20
-PP40_EPOCHS = (40, 40, 60, 75)  # 5x5, 10x10, 20x20, 40x40
+PP40_EPOCHS = (40, 40, 60, 50)  # 5x5, 10x10, 20x20, 40x40
 PCP20_EPOCHS = (50, 50, 75)  # 5x5, 10x10, 20x20
 RECT_EPOCHS = (80, 80)  # 10x20, 20x40
 STILL_EPOCHS = (100, 100, 150)  # at most, where a stage ends by itself
@@ -82,7 +82,8 @@ class Variant:
 
 
 VARIANTS = {
-    "hetnet": Variant("hetnet"),
+    # A value for each agent: classes' values tell the agents apart too late (docs/settings.md).
+    "hetnet": Variant("hetnet", {"critic": "agent"}),
     "ic3net": Variant("ic3net"),
     "ic3net-talking": Variant("ic3net", {"message": "talking"}),
     "ic3net-max": Variant("ic3net", {"message": "max"}),
@@ -285,7 +286,14 @@ def _studies(part: Part, name: str) -> list[Study]:
             for rival, kind in RIVALS.items()
         ]
     words, stages = _stages(part, learner)
-    return [Study(f"{part}-{name}", part, name, words, stages, variant.settings)]
+    # Scratch takes longer than all else and shares nothing with it: it can be run on its own.
+    alone = {SCRATCH: [stage for stage in stages if stage.name == SCRATCH]}
+    runs = {"": [stage for stage in stages if stage.name != SCRATCH], **alone}
+    return [
+        Study(f"{part}-{name}-{run}".strip("-"), part, name, words, tuple(own), variant.settings)
+        for run, own in runs.items()
+        if own
+    ]
 
 
 def _stages(part: Part, learner: LearnerConfig) -> tuple[str, tuple[Stage, ...]]:
