@@ -173,7 +173,7 @@ def command_of(arguments: list[str]) -> str:
     kept, skipped = [], False
     for argument in arguments[1:]:
         skipped = skipped and not argument.startswith("--")
-        if argument in PRIVATE:
+        if argument.partition("=")[0] in PRIVATE:
             skipped = True
         elif not skipped:
             kept.append(argument)
