@@ -37,10 +37,10 @@ PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 PROVENANCE = "provenance"
 
 KEPT = """\
-[curves.csv](curves.csv) has an epoch of a seed in a row, [evaluations.csv](evaluations.csv)
-the held-out episodes, [references.csv](references.csv) a random team and the shortest paths on the
-same starts, [seconds_per_epoch.csv](seconds_per_epoch.csv) the speed.
-`tests/experiments/paper/test_recomputed.py` works the figures of the README and of the pages in
+[curves.csv](curves.csv) has an epoch of a seed in a row, [evaluations.csv](evaluations.csv) the
+held-out episodes, [references.csv](references.csv) a random team and the shortest paths on the same
+starts, [seconds_per_epoch.csv](seconds_per_epoch.csv) the speed. A test
+(`tests/experiments/paper/test_recomputed.py`) works the figures of the README and of the pages in
 `docs/` out of them once more, without this program. Larger grids have rows of their own:
 [scale](scale/README.md)."""
 
@@ -416,6 +416,7 @@ def report(results: Results) -> str:
         KEPT,
         "## Claim by claim",
         markdown([_line(claim) for group in by_name.values() for claim in group]),
+        "What they were under the rules before these: [docs/verdicts.md](../../docs/verdicts.md).",
         "### How a verdict is found",
         RULES,
         "## Table I: steps taken at the paper's fixed hour",
@@ -456,6 +457,7 @@ def report(results: Results) -> str:
         "## Commands",
         "As they were given at their commits; the program was `experiments/reproduce_paper.py` "
         "before it became `python -m experiments.paper`.",
+        _configurations(results.directory),
         _commands(results.directory),
     ]
     return "\n\n".join(line.rstrip("\n") for line in lines) + "\n"
@@ -508,6 +510,17 @@ def _budgets(results: Results, known: Iterable[str]) -> str:
 def _kept(preset: str, last: Mapping[int, int]) -> str:
     epochs = sorted(set(last.values()))
     return f"{preset}: {len(last)} seeds, {' or '.join(map(str, epochs))} epochs"
+
+
+def _configurations(directory: Path) -> str:
+    """How many of the files say with which settings their runs were trained."""
+    files = list((directory / PROVENANCE).glob("*.json"))
+    kept = sum("experiment" in json.loads(file.read_text()) for file in files)
+    return (
+        f"The resolved configuration (tasks, starts, every setting of the learner) is in {kept} of "
+        f"{len(files)} files, those of runs since the program keeps it; of the others it is what "
+        "their commit makes of their command."
+    )
 
 
 def _commands(directory: Path) -> str:

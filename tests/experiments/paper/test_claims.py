@@ -4,8 +4,9 @@ import pytest
 
 from experiments.paper.claims import FAILS, HOLDS, IN_PART, NOT_RUN, OPEN, claims
 from experiments.paper.published import EXPERIMENTS
+from experiments.paper.results import Results
 
-from .rows import arms
+from .rows import RESULTS, arms
 
 Q1 = "Q1, PP, IC3Net on the source: upsampling does no harm"
 Q2 = "Q2, PP, IC3Net, 10x10 5P"
@@ -140,3 +141,18 @@ def test_longer_on_the_source_by_the_papers_hours():
         claim = found("pp-hetnet", source=upsampled, source_plain=plain)[LONGER]
         assert claim.verdict == verdict
     assert found("pp-hetnet", source=late[:1], source_plain=early)[LONGER].verdict == OPEN
+
+
+def test_the_page_of_verdicts_has_todays():
+    """Every claim of the kept rows, in order, with the verdict that it has now."""
+    page = (RESULTS.parents[1] / "docs" / "verdicts.md").read_text()
+    listed = [tuple(map(str.strip, line[1:-1].split("|"))) for line in page.splitlines() if line]
+    rows = Results.read(RESULTS).rows["curves"]
+    now = {
+        (claim.name, claim.preset, claim.verdict)
+        for preset in ("fast", "paper")
+        for claim in claims(rows, preset)
+    }
+    said = [row for row in listed if len(row) == 4 and row[1] in ("fast", "paper")]
+    assert {(claim, preset, verdict) for claim, preset, _, verdict in said} == now
+    assert len(said) == len(now)

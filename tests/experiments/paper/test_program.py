@@ -48,6 +48,8 @@ def test_only_what_is_missing_is_run(tiny, monkeypatch):
         run(tiny)
     run(tiny)
     assert ran == ["source/seeds-0", *["transfer/seeds-0"] * 2, "scratch/seeds-0"]
+    for file in (tiny.output / "provenance").glob("*.json"):
+        assert json.loads(file.read_text())["experiment"] == {"seeds": [0], "preset": "fast"}
     run(replace(tiny, seeds=(0, 1, 2)))
     assert ran[4:] == [f"{arm}/seeds-1-2" for arm in ("source", "transfer", "scratch")]
     run(replace(tiny, seeds=(0, 1, 2), experiments=("optimiser",)))
