@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments.scaling.costs import LEVELS, UNITS, Arm, arms
 from experiments.scaling.figures import cost_figure, curves_figure, matrix_figure
-from experiments.scaling.plans import OWN_POLICIES, PARTS
+from experiments.scaling.plans import PARTS
 from experiments.scaling.results import Results, Row
 from experiments.scaling.runs import ELSEWHERE, END, ZERO_SHOT
 from sumajax.reporting import write_text
@@ -58,7 +58,7 @@ def write_report(results: Results) -> None:
         text.append(f"Not run: {', '.join(missing)}.\n")
     write_text(directory / "tables.md", "\n".join(text))
     cost_figure(found, directory / "cost.png")
-    for part in OWN_POLICIES:
+    for part in PARTS:
         own = [arm for arm in found if arm.about["part"] == part]
         if own:
             curves_figure(own, directory / f"curves-{part}.png")

@@ -68,7 +68,7 @@ class StudyRun:
             rows = read_csv(file)
             label = task_label(env)
             known = {(r["stage"], r["when"], r["task"], r["mode"]) for r in rows}
-            modes = MODES[:1] if when == ELSEWHERE else MODES
+            modes: tuple[str, ...] = MODES[:1] if when == ELSEWHERE else MODES
             modes = tuple(m for m in modes if (stage.name, when, label, m) not in known)
             if not modes:
                 continue
