@@ -1,6 +1,7 @@
 """Source stage -> checkpoint -> target stage: what carries over, what does not, what is refused."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +87,28 @@ def test_some_of_the_sources_seeds_go_on_by_their_number(source, tmp_path):
     second = jax.tree.map(lambda x: x[1:], result.states.params)
     assert equal(states.params, second)
     assert untrained_parameters(trained.directory, trained.learner, states.params, (1,)) == []
+
+
+def test_a_critic_of_its_own_begins_anew_and_is_saved_with_the_rest(source, tmp_path):
+    """After a source that had none; and a stage stopped half way comes to the same end."""
+    trained, _ = source
+    policy = make_policy("ic3net", TARGET, hidden=8)
+    learner = make_learner(TARGET, policy, replace(CONFIG, critic="state"))
+    whole = StageRun("target", learner, 2, (0, 1), tmp_path / "whole")
+    stopped = replace(whole, directory=tmp_path / "stopped")
+    start = partial(transferred_states, whole, trained.directory)
+    assert equal(start().critic, fresh_states(whole).critic)
+    end = run_stage(whole, start, chunk=1).states
+    with pytest.raises(KeyboardInterrupt):
+        run_stage(stopped, start, chunk=1, stop_asked=lambda: True)
+    again = run_stage(stopped, lambda: pytest.fail("it had begun"), chunk=1)
+    assert again.first_epoch == 1
+    assert equal(again.states.critic, end.critic)
+    assert equal(again.states.params, end.params)
+    # Who goes on from it takes the policy alone.
+    back = transferred_states(stage(TARGET, tmp_path / "back"), whole.directory)
+    assert back.critic is None
+    assert equal(back.params, end.params)
 
 
 def test_modules_that_are_left_out_stay_fresh(source, tmp_path):
