@@ -76,7 +76,8 @@ def ratio_of_means(first: Sample, second: Sample, of_one_kind: bool = True) -> R
     value = float(first.mean() / second.mean())
     if not of_one_kind or min(len(first), len(second)) < LEAST_SEEDS:
         return Ratio(value)
-    return Ratio(value, *map(float, log_interval(first, second)))
+    low, high = log_interval(first, second)
+    return Ratio(value, float(low), float(high))
 
 
 def log_interval(first: np.ndarray, second: np.ndarray) -> tuple[Any, Any]:
