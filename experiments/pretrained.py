@@ -130,6 +130,7 @@ def card_of(agent: Agent) -> dict[str, Any]:
         "name": name_of(agent.env, agent.policy.name),
         "task": f"{type(task).__name__}, {grid_label(task.shape)}, {team_label(task)} "
         f"{domain_of(task).members}, at most {task.max_steps} steps",
+        "team": f"{team_label(task)} {domain_of(task).members}",
         "seen_at": grid_label(agent.env.state_shape[-2:]),
         "policy": agent.policy.name,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(agent.params)),
@@ -193,7 +194,7 @@ def meta_of(directory: Path, agent: Agent, seed: int) -> dict[str, Any]:
 
 def table() -> str:
     """The store's policies for docs/pretrained.md, a row each."""
-    columns = "name", "task", "sampled", "success", "greedy", "success", "shortest paths", "seed"
+    columns = "name", "team", "sampled (success)", "greedy (success)", "shortest", "seed"
     rows = [columns, ("---",) * len(columns), *map(_row, store.names())]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
@@ -201,17 +202,13 @@ def table() -> str:
 def _row(name: str) -> tuple[str, ...]:
     card = store.card(name)
     figures = [
-        text
+        f"{card['held_out'][mode]['steps_taken']:.2f} ({card['held_out'][mode]['success']:.3f})"
         for mode in MODES
-        for text in (
-            f"{card['held_out'][mode]['steps_taken']:.2f}",
-            f"{card['held_out'][mode]['success']:.3f}",
-        )
     ]
     bound = card["held_out"]["shortest_path_steps"]
     seed = f"{card['seed']} of {', '.join(map(str, card['seeds_tried']))}"
     shortest = "-" if bound is None else f"{bound:.2f}"
-    return f"`{name}`", card["task"], *figures, shortest, seed
+    return f"`{name}`", card["team"], *figures, shortest, seed
 
 
 def write_table(page: Path = PAGE) -> None:

@@ -28,12 +28,16 @@ NARROW = {"float32", "int32", "uint32", "bool"}
 
 SAME = [
     {"jax_enable_x64": True},
-    {"jax_numpy_rank_promotion": "raise", "jax_numpy_dtype_promotion": "strict"},
+    {
+        # Each of them refuses something, and changes nothing that it does not refuse.
+        "jax_numpy_rank_promotion": "raise",
+        "jax_numpy_dtype_promotion": "strict",
+        "jax_legacy_prng_key": "error",
+        "jax_enable_custom_prng": True,
+    },
     {"jax_default_prng_impl": "rbg"},
     {"jax_default_prng_impl": "unsafe_rbg"},
-    {"jax_legacy_prng_key": "error", "jax_enable_custom_prng": True},
-    {"jax_debug_nans": True},
-    {"jax_debug_infs": True},
+    {"jax_debug_nans": True, "jax_debug_infs": True},
     {"jax_debug_key_reuse": True},
     {"jax_check_tracer_leaks": True, "jax_enable_checks": True},
     {"jax_default_matmul_precision": "highest"},
@@ -74,11 +78,16 @@ def results(directory, env=PP):
     policy = make_policy("ic3net", env, hidden=4, encoder="linear")
     config = preset("fast", num_envs=2000, rollout_length=10)
     learner = make_learner(env, policy, config)
-    state, metrics = learner.train(learner.init(key_of(3)), 3)
-    whole = jax.tree.map(lambda x: x[None], {"params": state.params})
+    state, metrics = learner.train(jax.jit(learner.init)(key_of(3)), 3)
+    whole = jax.tree.map(lambda x: x[None], {"params": jax.device_get(state.params)})
     checkpoint.save(directory, whole, checkpoint.describe(env, policy, seeds=[7]))
     agent = load_agent(directory, seed=7)
-    obs = env.observe(env.reset(key_of(1)))
+
+    @jax.jit
+    def acted(start, key):
+        obs = env.observe(env.reset(start))
+        return [agent.act(agent.initial_carry(), obs, key, greedy=g) for g in (False, True)]
+
     held_out = [
         evaluate(env, policy, agent.params, key_of(5), episodes=FEW, greedy=greedy)
         for greedy in (False, True)
@@ -91,7 +100,7 @@ def results(directory, env=PP):
         "held out": held_out,
         "random": evaluate_random(env, policy, key_of(5), episodes=FEW),
         "bound": shortest_path_steps(env, FEW),
-        "acted": [agent.act(agent.initial_carry(), obs, key_of(2), greedy=g) for g in (0, 1)],
+        "acted": acted(key_of(1), key_of(2)),
     }
 
 

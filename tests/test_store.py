@@ -1,5 +1,6 @@
 """The trained policies of the package: each holds to its card, and stands wherever a run can."""
 
+import re
 from pathlib import Path
 
 import jax
@@ -96,6 +97,12 @@ def test_a_card_says_what_has_to_be_known(name):
 
 def test_the_page_has_the_figures_of_the_cards():
     assert f"{TABLE}\n\n{table()}\n{END}" in PAGE.read_text()
+
+
+@pytest.mark.parametrize("page", ["docs/pretrained.md", "docs/export.md", "README.md"])
+def test_policies_that_pages_name_are_there(page):
+    named = re.findall(r"\bp(?:cp|p)-\d+x\d+[\w-]*", (PAGE.parents[1] / page).read_text())
+    assert set(named) <= set(store.names())
 
 
 def test_all_together_they_are_small():

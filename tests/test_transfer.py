@@ -73,7 +73,7 @@ def test_one_source_seed_serves_several(source, tmp_path):
     states = jax.tree.map(lambda x: x[:1], result.states)
     meta = checkpoint.describe(SOURCE, trained.learner.policy, seeds=[0], epoch=1)
     checkpoint.save(single, states, meta)
-    started = transferred_states(stage(TARGET, tmp_path / "t", seeds=(3, 4, 5)), single)
+    started = transferred_states(stage(TARGET, tmp_path / "t", seeds=(3, 4)), single)
     for leaf, of_source in zip(
         jax.tree.leaves(started.params), jax.tree.leaves(result.states.params), strict=True
     ):

@@ -67,10 +67,11 @@ def cost_lines(found: Sequence[Arm]) -> dict[tuple[str, str], dict[int, Arm]]:
         own = [arm for arm in found if arm.about["part"] == part]
         for policy in dict.fromkeys(arm.about["policy"] for arm in own):
             of_policy = [arm for arm in own if arm.about["policy"] == policy]
-            chain = max(of_policy, key=lambda arm: len(arm.about["after"].split()))
-            first = next(arm for arm in of_policy if not arm.about["after"])
-            ends = {"chain": [first, chain], "scratch": [first]}
-            ends["scratch"] += [arm for arm in of_policy if arm.about["stage"] == SCRATCH]
+            scratch = [arm for arm in of_policy if arm.about["stage"] == SCRATCH]
+            staged = [arm for arm in of_policy if arm.about["stage"] != SCRATCH]
+            first = [arm for arm in staged if not arm.about["after"]]
+            last = sorted(staged, key=lambda arm: len(arm.about["after"].split()))[-1:]
+            ends = {"chain": first + last, SCRATCH: first + scratch}
             for kind, of_kind in ends.items():
                 by_side = lines.setdefault((policy, kind), {})
                 for arm in of_kind:

@@ -4,7 +4,7 @@ sumajax evaluate runs/pp_transfer-ic3net-fast
 sumajax evaluate runs/pp_transfer-ic3net-fast --sizes 5 10 --teams 3 5 8
 sumajax evaluate runs/pcp_transfer-hetnet-fast --teams 3+2 --json all.json
 sumajax evaluate runs/mine/checkpoints/transfer --modes greedy --replay best.gif
-sumajax evaluate pp-10x10-hetnet --replay r.gif
+sumajax evaluate pp-10x10-ic3net --replay r.gif
 """
 
 import sys
@@ -50,7 +50,7 @@ class EvaluateConfig:
 
     path: tyro.conf.Positional[Path]
     """Directory of a run (all its policies), of one of its checkpoints/<arm>, or one checkpoint; or
-    the name of a trained policy of the package, as pp-10x10-hetnet."""
+    the name of a trained policy of the package, as pp-10x10-ic3net."""
     sizes: tuple[str, ...] = ()
     """Grids, as 10 or 10x20, that divide the policy's own; those it was trained on if not given."""
     teams: tuple[str, ...] = ()

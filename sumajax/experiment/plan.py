@@ -169,6 +169,11 @@ class Experiment:
         fresh = [s for s in self.stages if s.start is None and s not in self.chain]
         return next((s for s in fresh if s.env == self.target.env), None)
 
+    def evaluates_every(self, stage: Stage) -> int:
+        """Epochs between held-out evaluations while `stage` trains; 0 for none."""
+        begins = stage.start is None and stage.env != self.target.env
+        return 0 if begins else self.evaluate_every
+
     def policy_on(self, env: Environment) -> Policy:
         """The policy, shaped for a task."""
         if isinstance(self.policy, str):

@@ -293,8 +293,7 @@ class Recorder:
         metrics_file.append_rows(self.metrics, rows)
         self.loggers.log(rows)
         experiment = self.run.experiment
-        begins = stage.start is None and stage.env != experiment.target.env
-        every = 0 if begins else experiment.evaluate_every
+        every = experiment.evaluates_every(stage)
         if every and chunk.epoch // every > chunk.first_epoch // every:
             policy, params = stage_run.learner.policy, by_seed(chunk.states.params)
             evaluation = held_out(stage.env, policy, params, experiment.episodes, "sampled")

@@ -42,6 +42,13 @@ def test_roles_follow_from_where_stages_start_not_from_names():
     assert other_task.scratch is None
 
 
+def test_all_stages_are_evaluated_on_the_way_but_the_first_of_a_chain():
+    experiment = Experiment(STAGES, evaluate_every=5)
+    every = {stage.name: experiment.evaluates_every(stage) for stage in STAGES}
+    assert every == {"a": 0, "b": 5, "c": 5, "scratch": 5}
+    assert Experiment(STAGES[:1], evaluate_every=5).evaluates_every(STAGES[0]) == 5
+
+
 def test_one_stage_is_its_own_target():
     experiment = Experiment(STAGES[:1])
     assert experiment.target.name == "a"

@@ -117,6 +117,17 @@ def test_lines_of_the_figure_are_chain_and_scratch_from_one_first_stage(results)
     }
 
 
+def test_scratch_that_is_kept_alone_is_no_chain(results):
+    for rows in results.rows.values():
+        rows[:] = [row for row in rows if row["stage"] == "scratch"]
+    lines = cost_lines(arms(results))
+    assert {kind: list(by_side) for (_, kind), by_side in lines.items()} == {
+        "chain": [],
+        "scratch": [20],
+    }
+    write_report(results)
+
+
 def test_a_band_is_the_mean_and_range_over_seeds_at_each_point(results):
     cost, low, middle, high = band(arm_of(results, "20x20"), 0)
     np.testing.assert_array_equal(cost, [20_000, 40_000, 60_000, 60_000])
