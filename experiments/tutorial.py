@@ -118,7 +118,9 @@ transfer_stage, scratch_stage = stage_of("transfer", target), stage_of("scratch"
 start = transferred_states(transfer_stage, source_stage.directory)
 untrained = jax.tree.map(lambda leaf: leaf[0], start.params)  # seed 0, before any training there
 run_stage(transfer_stage, lambda: start, on_chunk=follow(transfer_stage))
-rival = run_stage(scratch_stage, lambda: fresh_states(scratch_stage), on_chunk=follow(scratch_stage))
+rival = run_stage(
+    scratch_stage, lambda: fresh_states(scratch_stage), on_chunk=follow(scratch_stage)
+)
 
 # transfer epoch  5:  89.0 steps, success 0.74, 5 s     (the critic alone learns at first)
 # transfer epoch 10:  31.3 steps, success 0.99, 5 s
