@@ -16,8 +16,12 @@ program is not cut into parts for cores that other workers have."""
 
 
 def known(flag: str) -> bool:
-    """Whether this jaxlib has a flag: XLA ends the process at one that it does not know."""
-    name = flag.split("=")[0].encode()
+    """Whether this jaxlib has a flag: XLA ends the process at one that it does not know.
+
+    A flag's name is a string of its own in the library, ended by a zero on either side; names that
+    were flags once stay in descriptions of messages (the second one, with JAX 0.12).
+    """
+    name = b"\0" + flag.split("=")[0].encode() + b"\0"
     for library in Path(find_spec("jaxlib").origin).parent.glob("*jax_common*"):
         with open(library, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as m:
             if m.find(name) >= 0:
