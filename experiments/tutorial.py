@@ -101,7 +101,7 @@ def follow(stage: StageRun) -> Callable[[Chunk], None]:
 
 
 source_stage = stage_of("source", source)
-run_stage(source_stage, lambda: fresh_states(source_stage), on_chunk=follow(source_stage))
+trained = run_stage(source_stage, lambda: fresh_states(source_stage), on_chunk=follow(source_stage))
 
 # source   epoch  5:  33.6 steps, success 0.85, 3 s
 # source   epoch 10:   7.6 steps, success 1.00, 3 s
@@ -118,7 +118,9 @@ transfer_stage, scratch_stage = stage_of("transfer", target), stage_of("scratch"
 start = transferred_states(transfer_stage, source_stage.directory)
 untrained = jax.tree.map(lambda leaf: leaf[0], start.params)  # seed 0, before any training there
 run_stage(transfer_stage, lambda: start, on_chunk=follow(transfer_stage))
-run_stage(scratch_stage, lambda: fresh_states(scratch_stage), on_chunk=follow(scratch_stage))
+rival = run_stage(
+    scratch_stage, lambda: fresh_states(scratch_stage), on_chunk=follow(scratch_stage)
+)
 
 # transfer epoch  5:  89.0 steps, success 0.74, 5 s     (the critic alone learns at first)
 # transfer epoch 10:  31.3 steps, success 0.99, 5 s
