@@ -50,7 +50,7 @@ def cost_figure(found: Sequence[Arm], output: Path) -> None:
         axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.set_xlim(min(sides) / 1.2, max(sides) * 1.2)
-        axes.set_ylabel(f"{label} to {LEVEL:g} x shortest paths", color=INK)
+        axes.set_ylabel(f"{label}\nto {LEVEL:g} x shortest paths", color=INK)
     handles, names = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper left", ncols=4, frameon=False, fontsize=9)
     note = (
@@ -61,7 +61,11 @@ def cost_figure(found: Sequence[Arm], output: Path) -> None:
 
 
 def cost_lines(found: Sequence[Arm]) -> dict[tuple[str, str], dict[int, Arm]]:
-    """(policy, chain or scratch) -> arms by the grid's side; the first stage is both."""
+    """(policy, chain or scratch) -> arms by the grid's side; the first stage is both.
+
+    A grid that has a part of its own is of that part; what larger chains pass on their way stands
+    for the others.
+    """
     lines: dict[tuple[str, str], dict[int, Arm]] = {}
     for part in PP_PARTS:
         own = [arm for arm in found if arm.about["part"] == part]
@@ -70,8 +74,9 @@ def cost_lines(found: Sequence[Arm]) -> dict[tuple[str, str], dict[int, Arm]]:
             scratch = [arm for arm in of_policy if arm.about["stage"] == SCRATCH]
             staged = [arm for arm in of_policy if arm.about["stage"] != SCRATCH]
             first = [arm for arm in staged if not arm.about["after"]]
-            last = sorted(staged, key=lambda arm: len(arm.about["after"].split()))[-1:]
-            ends = {"chain": first + last, SCRATCH: first + scratch}
+            chain = [arm for arm in staged if arm.about["stage"] != DIRECT]
+            chain.sort(key=lambda arm: len(arm.about["after"].split()), reverse=True)
+            ends = {"chain": chain} | ({SCRATCH: first + scratch} if scratch else {})
             for kind, of_kind in ends.items():
                 by_side = lines.setdefault((policy, kind), {})
                 for arm in of_kind:

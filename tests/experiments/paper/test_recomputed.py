@@ -245,6 +245,36 @@ def evaluated_cells(name, arm):
     return [f"{steps:.1f} M" if steps else "0", *cells]
 
 
+def larger_grid(title):
+    """Of the chain to 40x40: its stage on such a grid, at the task's limit or the one named."""
+    grid, limit = re.match(r"(\d+x\d+), \d+ predators, limit (\d+)", title).groups()
+    own = {"experiment": "pp40-hetnet", "stage": grid}
+    (task,) = {row["task"] for row in read("scale/stages") if own.items() <= row.items()}
+    played = [
+        row
+        for row in read("scale/held_out")
+        if {**own, "task": task, "limit": limit}.items() <= row.items()
+    ]
+    assert {row["episodes"] for row in played} == {"1024"}
+
+    def mean(when, mode):
+        rows = [row for row in played if (row["when"], row["mode"]) == (when, mode)]
+        steps = [float(row["steps_taken"]) for row in rows]
+        success = np.mean([float(row["success"]) for row in rows])
+        between = f"{min(steps):.1f}-{max(steps):.1f}"
+        return f"{np.mean(steps):.1f} ({between}; {success:.3f})"
+
+    stage = [row for row in read("scale/stages") if own.items() <= row.items()]
+    (trained,), (bound,) = ({row[name] for row in stage} for name in ("env_steps", "bound"))
+    return [
+        f"{int(trained) / 1e6:.1f} M",
+        mean("zero shot", "sampled"),
+        mean("end", "sampled"),
+        mean("end", "greedy"),
+        f"{float(bound):.1f}",
+    ]
+
+
 TABLES = {
     "main": main,
     "ablations pp-ic3net": ablations("pp-ic3net"),
@@ -254,6 +284,7 @@ TABLES = {
     "evaluations pp-magic": evaluated("pp-magic"),
     "evaluations pp-hetnet": evaluated("pp-hetnet"),
     "evaluations pcp": capture,
+    "larger grids": larger_grid,
 }
 
 
@@ -292,6 +323,7 @@ def test_every_table_is_found():
         "evaluations pp-magic": 4,
         "evaluations pp-hetnet": 6,
         "evaluations pcp": 7,
+        "larger grids": 4,
     }
 
 
