@@ -44,7 +44,7 @@ LICENCE = "MIT"
 PAGE = Path(__file__).parents[1] / "docs" / "pretrained.md"
 TABLE = "<!-- python -m experiments.pretrained writes the table -->"
 END = "<!-- end of the table -->"
-PRIVATE = ("--output",)
+PRIVATE = ("--output", "--runs")
 """Options that say where a run was written, and nothing of what it was."""
 
 

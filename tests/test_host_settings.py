@@ -84,9 +84,12 @@ def results(directory, env=PP):
     agent = load_agent(directory, seed=7)
 
     @jax.jit
-    def acted(start, key):
+    def acted(start, *keys):
         obs = env.observe(env.reset(start))
-        return [agent.act(agent.initial_carry(), obs, key, greedy=g) for g in (False, True)]
+        return [
+            agent.act(agent.initial_carry(), obs, key, greedy=greedy)
+            for key, greedy in zip(keys, (False, True), strict=True)
+        ]
 
     held_out = [
         evaluate(env, policy, agent.params, key_of(5), episodes=FEW, greedy=greedy)
@@ -100,7 +103,7 @@ def results(directory, env=PP):
         "held out": held_out,
         "random": evaluate_random(env, policy, key_of(5), episodes=FEW),
         "bound": shortest_path_steps(env, FEW),
-        "acted": acted(key_of(1), key_of(2)),
+        "acted": acted(key_of(1), key_of(2), key_of(3)),
     }
 
 

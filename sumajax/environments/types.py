@@ -164,7 +164,7 @@ def measured(env: Environment, state: Any, transition: Transition, following: An
     collisions per car, the cars that have collided in the step and those that came with it.
     """
     if not figure_names(env):
-        return jnp.zeros((0, 2))
+        return jnp.zeros((0, 2), jnp.float32)
     return jnp.asarray(env.measure(state, transition, following), jnp.float32)  # type: ignore[attr-defined]
 
 

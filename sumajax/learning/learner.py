@@ -227,9 +227,11 @@ class Learner:
         loss = tally.loss.policy + tally.loss.value + tally.loss.entropy
         faults = guard.faults_of(loss, norm, self._weights(following))
         nothing = jax.tree.map(jnp.zeros_like, tally)
-        following, tally = guard.unless(faults, (following, tally), (state, nothing))
-        following = replace(following, updates=state.updates + tally.updates)
-        return following, replace(tally, faults=faults)
+        # The key stays as it is; chosen between it and itself, it would be used twice.
+        new, old = (replace(s, key=None) for s in (following, state))
+        kept, tally = guard.unless(faults, (new, tally), (old, nothing))
+        updates = state.updates + tally.updates
+        return replace(kept, key=state.key, updates=updates), replace(tally, faults=faults)
 
     def _weights(self, state: TrainState) -> dict[str, Any]:
         """All that gradients are taken of: the policy's parameters, and a critic's of its own."""

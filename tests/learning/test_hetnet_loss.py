@@ -129,13 +129,14 @@ def test_each_environment_is_clipped_alone():
     alone = make_learner(env, policy, unclipped)
     state = jax.jit(whole.init)(jax.random.key(0))
     actors, draws = whole._inputs(state)
-    ours, (_, tally) = jax.jit(whole._gradient)(state.params, actors, draws, state.updates)
+    weights = whole._weights(state)
+    ours, (_, tally) = jax.jit(whole._gradient)(weights, actors, draws, state.updates)
     of_one = jax.jit(alone._gradient)
     parts = []
     for e in range(config.num_envs):
         lane = jax.tree.map(lambda x, e=e: x[e : e + 1], actors)
         lane_draws = jax.tree.map(lambda x, e=e: x[:, e : e + 1], draws)
-        parts.append(of_one(state.params, lane, lane_draws, state.updates)[0])
+        parts.append(of_one(weights, lane, lane_draws, state.updates)[0])
     norms = [float(jnp.sqrt(sum((g**2).sum() for g in jax.tree.leaves(part)))) for part in parts]
     assert max(norms) > config.max_grad_norm, "nothing to clip"
     scales = [min(1.0, config.max_grad_norm / norm) for norm in norms]

@@ -204,7 +204,7 @@ def test_states_encoded_once_or_at_every_step_give_the_same_gradients():
     by_table = tiny_learner(TINY_TASK, **shape)
     direct = tiny_learner(Unlisted(size=3, num_predators=2, max_steps=5), **shape)
     state = jax.jit(by_table.init)(jax.random.key(0))
-    inputs = state.params, *by_table._inputs(state), state.updates
+    inputs = by_table._weights(state), *by_table._inputs(state), state.updates
     results = [jax.jit(learner._gradient)(*inputs) for learner in (by_table, direct)]
     close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6)
     jax.tree.map(close, *results)
