@@ -44,6 +44,8 @@ LICENCE = "MIT"
 PAGE = Path(__file__).parents[1] / "docs" / "pretrained.md"
 TABLE = "<!-- python -m experiments.pretrained writes the table -->"
 END = "<!-- end of the table -->"
+STUDY = "scale.py"
+"""Of the programs that train, the one that is not a part of `sumajax`."""
 PRIVATE = ("--output", "--runs")
 """Options that say where a run was written, and nothing of what it was."""
 
@@ -178,7 +180,9 @@ def command_of(arguments: list[str]) -> str:
             skipped = True
         elif not skipped:
             kept.append(argument)
-    return shlex.join(["sumajax", *kept])
+    of_a_clone = Path(arguments[0]).name == STUDY
+    program = ["python", "-m", f"experiments.{Path(STUDY).stem}"] if of_a_clone else ["sumajax"]
+    return shlex.join([*program, *kept])
 
 
 def meta_of(directory: Path, agent: Agent, seed: int) -> dict[str, Any]:
