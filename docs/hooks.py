@@ -17,7 +17,8 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
-PLACES = {ROOT / "docs": "", ROOT / "experiments/results": "results", ROOT / "benchmarks": "speed"}
+DOCS = ROOT / "docs"
+PLACES = {DOCS: "", ROOT / "experiments/results": "results", ROOT / "benchmarks": "speed"}
 """Folders of the repository that have pages, and where the site has them."""
 LINK = re.compile(r"(?<=\]\()(?!https?:|#)[^)#\s]+")
 
@@ -41,13 +42,13 @@ def notebook() -> tuple[str, dict[str, bytes]]:
     return link + lesson, resources["outputs"]
 
 
-def linked(page: Path) -> set[Path]:
-    """The page and all that it links to, through other pages, within its folder."""
-    found, waiting = {page}, [page]
+def linked(folder: Path) -> set[Path]:
+    """Files of `folder` that its README or a page of docs/ links to, through other pages too."""
+    found, waiting = {folder / "README.md"}, [folder / "README.md", *DOCS.rglob("*.md")]
     while waiting:
-        text = waiting.pop().read_text()
-        places = [page.parent / link for link in LINK.findall(text)]
-        new = {p for p in places if p.is_file() and ".." not in p.parts} - found
+        page = waiting.pop()
+        places = [(page.parent / link).resolve() for link in LINK.findall(page.read_text())]
+        new = {p for p in places if p.is_file() and p.is_relative_to(folder)} - found
         found |= new
         waiting += [p for p in new if p.suffix == ".md"]
     return found
@@ -64,7 +65,7 @@ def place_of(path: Path) -> str | None:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     for folder, place in PLACES.items():
         if place:
-            for path in sorted(linked(folder / "README.md")):
+            for path in sorted(linked(folder)):
                 uri = f"{place}/{path.relative_to(folder).as_posix()}"
                 files.append(File.generated(config, uri, abs_src_path=str(path)))
     _, pictures = notebook()

@@ -25,7 +25,7 @@ TITLES = {
 }
 HOW = """\
 Written by `python experiments/scale.py --rebuild` from the CSV files beside it; where each run
-comes from (command, commit, versions, machine, every setting) is in [provenance](provenance).
+comes from (command, commit, versions, machine, every setting) is in `provenance/`.
 
 Steps taken are means over the held-out starts (1,024 at the beginning and the end of a stage, 128
 on the way), then over seeds, with the least and the greatest seed and the success. Episodes that
