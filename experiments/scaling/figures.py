@@ -54,7 +54,8 @@ def cost_figure(found: Sequence[Arm], output: Path) -> None:
     handles, names = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper left", ncols=4, frameon=False, fontsize=9)
     note = (
-        "mean and all seeds, sources counted; open triangle: a seed that never arrived, at its cost"
+        "mean and all seeds, sources counted; squares: scratch; open triangle: a seed that never "
+        "arrived, at its cost"
     )
     figure.supxlabel(note, x=0.995, ha="right", fontsize=8, color=FAINT)
     write_png(figure, output)
@@ -99,7 +100,8 @@ def _cost_line(
         arrived = np.isfinite(cost)
         least = np.where(arrived, cost, arm.total(unit)) * scale
         means.append(least.mean())
-        marks = {"o": (least[arrived], colour), "^": (least[~arrived], "none")}
+        dot = "s" if kind == SCRATCH else "o"
+        marks = {dot: (least[arrived], colour), "^": (least[~arrived], "none")}
         for marker, (values, face) in marks.items():
             axes.scatter(
                 [side] * len(values),
