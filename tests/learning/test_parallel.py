@@ -122,6 +122,11 @@ def test_seeds_over_two_devices(two_devices):
     assert two_devices["over_seeds"] < 1e-5
 
 
+def test_a_critic_of_its_own_over_two_devices(two_devices):
+    """It learns from the environments of both."""
+    assert two_devices["own_critic"] < 1e-4
+
+
 def test_environments_of_a_seed_over_two_devices(two_devices):
     """Gradients and figures are added up, advantages normalised over all environments."""
     assert two_devices["envs_mesh"] == {"seeds": 1, "envs": 2}

@@ -15,12 +15,13 @@ SEEDS = [0, 1]
 
 
 def trained(learner, seeds, devices):
-    """Figures and parameters after an epoch."""
+    """Figures and parameters after an epoch, a critic's of its own too."""
     mesh = parallel.make_mesh(len(seeds), learner.config.num_envs, devices)
     states = parallel.place(parallel.init_seeds(learner, seeds), mesh)
     train = parallel.compile_train(learner, mesh, 1, states)
     states, metrics = train(states)
-    return jax.tree.map(np.asarray, (states.params, metrics)), dict(mesh.shape)
+    critic = states.critic and states.critic.params
+    return jax.tree.map(np.asarray, (states.params, critic, metrics)), dict(mesh.shape)
 
 
 def difference(a, b):
@@ -35,7 +36,10 @@ def compare():
     over_seeds, seeds_mesh = trained(learner, SEEDS, 2)
     over_envs, envs_mesh = trained(learner, SEEDS[:1], 2)
     first, second = (jax.tree.map(lambda x, s=s: x[s : s + 1], together) for s in (0, 1))
+    judged = tiny_learner(TINY_TASK, num_envs=200, rollout_length=20, critic="state")
+    alone, shared = (trained(judged, SEEDS[:1], devices)[0] for devices in (1, 2))
     return {
+        "own_critic": difference(alone, shared),
         "devices": jax.device_count(),
         "seeds_mesh": seeds_mesh,
         "over_seeds": difference(together, over_seeds),
