@@ -5,6 +5,8 @@ import os
 from importlib.util import find_spec
 from pathlib import Path
 
+import pytest
+
 LEAST_EFFORT = (
     "xla_backend_optimization_level=0",
     "xla_cpu_use_fusion_emitters=false",
@@ -39,3 +41,20 @@ def pytest_configure(config):
 
     jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+MOST_PIECES = 20_000
+"""Of memory, that a worker may have at the end of a file: Linux allows a process 65,530, each
+compiled program has several (forty of some with JAX 0.12), and XLA dies of a segmentation fault
+where there is no room for another."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room_for_programs():
+    """What earlier files compiled is forgotten in time."""
+    yield
+    pieces = Path("/proc/self/maps")
+    if pieces.exists() and len(pieces.read_text().splitlines()) > MOST_PIECES:
+        import jax
+
+        jax.clear_caches()

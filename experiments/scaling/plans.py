@@ -25,6 +25,7 @@ PP20_EPOCHS = (40, 40, 60)  # 5x5, 10x10, 20x20
 PP40_EPOCHS = (40, 40, 60, 50)  # 5x5, 10x10, 20x20, 40x40
 PCP20_EPOCHS = (50, 50, 75)  # 5x5, 10x10, 20x20
 RECT_EPOCHS = (80, 80)  # 10x20, 20x40
+BRIEF_EPOCHS = (15, 15, 60)  # 5x5, 10x10, 20x20: sources that have just learnt their task
 STILL_EPOCHS = (100, 100, 150)  # at most, where a stage ends by itself
 EVALUATE_EVERY = 5
 """Epochs between held-out evaluations while a stage trains."""
@@ -91,7 +92,7 @@ VARIANTS = {
     "magic": Variant("magic"),
 }
 
-Part = Literal["pp10", "pp20", "pp40", "pcp20", "rect", "rivals", "dilution", "still"]
+Part = Literal["pp10", "pp20", "pp40", "pcp20", "rect", "rivals", "dilution", "brief", "still"]
 PARTS: tuple[Part, ...] = get_args(Part)
 OWN_POLICIES: dict[str, tuple[str, ...]] = {
     "pp10": ("hetnet", "ic3net"),
@@ -101,6 +102,7 @@ OWN_POLICIES: dict[str, tuple[str, ...]] = {
     "rect": ("hetnet",),
     "rivals": ("hetnet",),
     "dilution": tuple(VARIANTS),
+    "brief": ("hetnet",),
     "still": ("hetnet",),
 }
 """What each part is run with where nothing is said."""
@@ -311,6 +313,8 @@ def _stages(part: Part, learner: LearnerConfig) -> tuple[str, tuple[Stage, ...]]
     envs = [seen_at(task, PP[2]) for task in PP[:3]]
     if part == "dilution":
         return "chain", chain_of(envs, PP20_EPOCHS, learner)
+    if part == "brief":
+        return "chain of brief sources", chain_of(envs, BRIEF_EPOCHS, learner)
     stages = chain_of(envs, STILL_EPOCHS, learner)
     return "chain that ends its stages itself", tuple(
         replace(stage, until=Still()) for stage in stages
