@@ -24,8 +24,8 @@ from flax import struct
 
 from sumajax.environments.types import Observation, Transition
 from sumajax.learning import LearnerConfig, losses, optimiser, preset, returns
-from sumajax.learning.learner import Learner, TrainState
-from sumajax.learning.rollout import Actors, Draws, last_value, rollout
+from sumajax.learning.learner import LOSSES, Learner, TrainState
+from sumajax.learning.rollout import Actors, Draws, Trajectory
 from sumajax.policies.ic3net import IC3Net, IC3NetCore
 from sumajax.policies.tarmac import TarMAC, TarMACCore
 from sumajax.policies.types import Policy, TeamSpec
@@ -164,18 +164,33 @@ class RecordedTarMAC(TarMAC):
 
 @dataclass(frozen=True, eq=False)
 class RecordedLearner(Learner):
-    """The learner, with a given start and given choices instead of its own draws."""
+    """The learner, with a given start and given choices instead of its own draws.
+
+    It keeps what its loss was given and made of it, and the gradients, as `update` is traced.
+    """
 
     given: tuple[Actors, Draws] | None = None
-    gradients: list[Any] = field(default_factory=list)  # of `update`, as it is traced
+    kept: list[tuple[Any, Arrays]] = field(default_factory=list)  # gradients, `out.*`
 
     def _inputs(self, state: TrainState) -> Any:
         return self.given
 
+    def _objective(self, *inputs: Any) -> Any:
+        results = {}
+
+        def actor_critic(trajectory: Trajectory, valid: chex.Array, beyond: chex.Array, *rest: Any):
+            loss, parts = losses.actor_critic(trajectory, valid, beyond, *rest)
+            results.update(batch_results(self.config, trajectory, beyond, loss, parts))
+            return loss, parts
+
+        with mock.patch.dict(LOSSES, actor_critic=actor_critic):
+            loss, (actors, tally) = super()._objective(*inputs)
+        return loss, ((actors, results), tally)
+
     def _gradient(self, *inputs: Any) -> Any:
-        gradients, aux = super()._gradient(*inputs)
-        self.gradients.append(gradients)
-        return gradients, aux
+        gradients, ((actors, results), tally) = super()._gradient(*inputs)
+        self.kept.append((gradients, results))
+        return gradients, (actors, tally)
 
 
 def part(fields: Arrays, k: int) -> Arrays:
@@ -243,13 +258,14 @@ def recorded_inputs(policy: Policy, update: Arrays, first: int, dtype: Any) -> t
     return start, Draws(noise=noise, fresh=following)
 
 
-def batch_results(learner: RecordedLearner, params: Any) -> Arrays:
+def batch_results(
+    config: LearnerConfig,
+    trajectory: Trajectory,
+    beyond: chex.Array,
+    loss: chex.Array,
+    parts: losses.LossParts,
+) -> Arrays:
     """Every `out.*` of an update."""
-    env, policy, config = learner.env, learner.policy, learner.config
-    actors, trajectory = rollout(env, policy, params, *learner.given, config.detach_gap)
-    beyond = last_value(env, policy, params, actors)
-    valid = jnp.ones(trajectory.last.shape, bool)
-    loss, parts = losses.actor_critic(trajectory, valid, beyond, config, 1.0)
     target = losses.estimate_returns(trajectory, beyond, config)
     decisions = trajectory.decisions
     by_step = {
@@ -265,9 +281,9 @@ def batch_results(learner: RecordedLearner, params: Any) -> Arrays:
 
 def update_results(learner: RecordedLearner, state: TrainState) -> tuple[TrainState, Arrays]:
     """The state after an update, and its `out.*` and `grad.*` (`grad.x` of the whole file)."""
-    results = batch_results(learner, state.params)
     next_state, tally = learner.update(state.replace(actors=learner.given[0]))
-    grads = jax.tree.map(lambda g: g / tally.env_steps, learner.gradients.pop()["policy"]["params"])
+    gradients, results = learner.kept.pop()
+    grads = jax.tree.map(lambda g: g / tally.env_steps, gradients["policy"]["params"])
     results |= data.dotted(grads["core"], "grad.") | {"grad.x": grads["observation"]["x"]}
     return next_state.replace(actors=None), results
 
