@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from drawn import drawn_parameters
 
 from sumajax.environments import Observation, PredatorCapturePrey, PredatorPrey
 from sumajax.policies import Policy, make_policy
@@ -39,18 +40,8 @@ def small(name: str, env: Any = PREY_THREE, **settings: Any) -> Policy:
 
 @lru_cache
 def parameters(policy: Policy, seed: int = 0) -> Any:
-    """Initial ones, drawn by one compiled program for all teams that have parameters in common.
-
-    Drawing HetNet's is what takes longest to compile of all that is done with it here.
-    """
-    key = jax.random.key(seed)
-    leaves, structure = jax.tree.flatten(jax.eval_shape(policy.init, key))
-    same = (type(policy.module), structure, tuple(leaf.shape for leaf in leaves))
-    return INITIALISERS.setdefault(same, jax.jit(policy.init))(key)
-
-
-INITIALISERS: dict[Any, Any] = {}
-"""By kind of policy and shapes of its parameters."""
+    """Some, of the size of the initial ones; the same for teams that have parameters in common."""
+    return drawn_parameters(policy, seed)
 
 
 @lru_cache

@@ -36,9 +36,9 @@ def second_step(policy, env, alive, disturb=None, order=None):
     params, step, n = parameters(policy), stepper(policy), env.num_agents
     noise = greedy(policy)
     if "graph" in noise:
-        noise["graph"] = jnp.full_like(noise["graph"], 9.0)
+        noise["graph"] = np.full_like(noise["graph"], 9.0)
     if "gate" in noise:
-        noise["gate"] = jnp.broadcast_to(jnp.array([0.0, 99.0]), (n, 2))
+        noise["gate"] = np.broadcast_to(np.array([0.0, 99.0], np.float32), (n, 2))
     everybody = None if alive is None else np.ones(n, bool)
     first = observe(env, 0, alive=everybody)
     second = observe(env, 1, alive=alive)
@@ -47,7 +47,7 @@ def second_step(policy, env, alive, disturb=None, order=None):
     carry, _ = step(params, policy.initial_carry(), first, noise)
     if disturb is not None:
         second = second.replace(view=np.where(disturb[:, None, None, None], 7.0, second.view))
-        carry = carry.replace(h=jnp.where(disturb[:, None], 0.9, carry.h))
+        carry = carry.replace(h=np.where(disturb[:, None], np.float32(0.9), carry.h))
     return step(params, carry, second, noise)
 
 
@@ -109,8 +109,8 @@ def test_a_team_with_absent_agents_is_the_smaller_team(name):
     params, here = parameters(small(name, THREE)), np.flatnonzero(ALIVE)
     large, few = small(name, FIVE), small(name, PREY_THREE)
     obs = observe(FIVE, 3, alive=ALIVE)
-    memory = {k: jax.random.normal(jax.random.key(5), (5, 16)) for k in ("h", "s")}
-    carry = large.initial_carry().replace(**memory, gate=jnp.ones(5))
+    memory = np.random.default_rng(5).normal(size=(5, 16)).astype(np.float32)
+    carry = large.initial_carry().replace(h=memory, s=memory, gate=np.ones(5, np.float32))
     _, output = stepper(large)(params, carry, obs, greedy(large))
     alone = obs.replace(state=obs.state[here], view=obs.view[here], alive=None)
     carry = jax.tree.map(lambda y: y[here], carry)
@@ -152,7 +152,7 @@ def test_an_observation_must_say_who_is_there_where_agents_leave():
     policy = small("commnet", THREE)
     carry, obs = policy.initial_carry(), observe(THREE, 0)
     with pytest.raises(ValueError, match="nothing says who is there: set `alive` of the observ"):
-        policy.apply(parameters(policy), carry, obs, jax.random.key(0))
+        jax.jit(policy.apply)(parameters(policy), carry, obs, jax.random.key(0))
 
 
 @pytest.mark.parametrize("name", ["hetnet", "hetnet-binary"])

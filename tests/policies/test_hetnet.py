@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from drawn import drawn
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.policies import TeamSpec, make_policy
@@ -39,19 +40,18 @@ def step(policy, obs, noise=None, params=None):
 def graph_of(num_p, num_a, bits=None):
     """A small graph part, its parameters and features of such a team."""
     graph = HetGraph(WIDTHS, heads=2, features=4, bits=bits)
-    keys = jax.random.split(jax.random.key(0), 4)
-    f_p = jax.random.normal(keys[0], (num_p, WIDTHS[0]))
-    f_a = jax.random.normal(keys[1], (num_a, WIDTHS[1]))
-    noise = jax.random.logistic(keys[2], (2, num_p + num_a, bits)) if bits else None
-    return graph, (f_p, f_a, jnp.ones((2, 4)), noise), keys[3]
+    random = np.random.default_rng(0)
+    shapes = (num_p, WIDTHS[0]), (num_a, WIDTHS[1]), (2, num_p + num_a, bits or 0)
+    f_p, f_a, noise = (random.normal(size=shape).astype(np.float32) for shape in shapes)
+    return graph, (f_p, f_a, np.ones((2, 4), np.float32), noise if bits else None)
 
 
 @pytest.mark.parametrize("bits", [None, 5])
 def test_parameters_do_not_depend_on_which_relations_have_edges(bits):
     trees = []
     for team in [(3, 2), (2, 1), (1, 0), (3, 0), (0, 2), (1, 1)]:
-        graph, inputs, key = graph_of(*team, bits=bits)
-        params = jax.eval_shape(graph.init, key, *inputs)
+        graph, inputs = graph_of(*team, bits=bits)
+        params = jax.eval_shape(graph.init, jax.random.key(0), *inputs)
         trees.append(jax.tree.map(lambda leaf: leaf.shape, params))
     assert all(tree == trees[0] for tree in trees)
 
@@ -89,7 +89,7 @@ def test_capture_agents_are_heard_too(name):
     def of_predators(state):
         return step(policy, obs.replace(state=state), noise).logits[:2].sum()
 
-    by_capturer = jax.grad(of_predators)(jnp.asarray(obs.state))[2]
+    by_capturer = jax.jit(jax.grad(of_predators))(obs.state)[2]
     assert (by_capturer != 0).any()
 
 
@@ -181,15 +181,15 @@ def test_binary_messages_are_all_that_agents_hear():
 
 @pytest.mark.parametrize("bits", [None, 5])
 def test_gradients_reach_every_parameter(bits):
-    graph, inputs, key = graph_of(3, 2, bits=bits)
-    params = jax.jit(graph.init)(key, *inputs)
+    graph, inputs = graph_of(3, 2, bits=bits)
+    params = drawn(graph.init, *inputs)
 
     def loss(params):
         logits, value, _ = graph.apply(params, *inputs)
         return sum((y**2).sum() for y in (*logits.values(), value))
 
     def zero(path, slope):
-        return jax.tree_util.keystr(path) if jnp.abs(slope).max() == 0 else None
+        return jax.tree_util.keystr(path) if np.abs(slope).max() == 0 else None
 
     gradient = jax.jit(jax.grad(loss))(params)
     chex.assert_tree_all_finite(gradient)
@@ -214,8 +214,8 @@ def test_state_nodes_know_the_team(env, descriptor):
 
 def test_the_published_descriptor_starts_the_critic_far_off():
     """Over initialisations: the raw numbers, up to 500, make first values of tens."""
-    obs = observe(PREY_THREE, 0)
-    initial = [parameters(small("hetnet"), seed) for seed in range(8)]  # of either descriptor
+    obs, init = observe(PREY_THREE, 0), jax.jit(small("hetnet").init)  # that of either descriptor
+    initial = [init(jax.random.key(seed)) for seed in range(8)]
 
     def spread(meta):
         policy = small("hetnet", meta=meta)

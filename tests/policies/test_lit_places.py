@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from drawn import drawn
 
 from sumajax.environments import PredatorPrey, SparseStates
 from sumajax.environments.states import listed_states
@@ -16,8 +17,9 @@ from sumajax.upsampling import StateUpsampled
 
 
 def random_states(share, size=7):
-    values = jax.random.normal(jax.random.key(3), (6, 1, size, size))
-    return values * jax.random.bernoulli(jax.random.key(4), share, values.shape)
+    random = np.random.default_rng(3)
+    values = random.normal(size=(6, 1, size, size)).astype(np.float32)
+    return values * (random.random(values.shape) < share)
 
 
 STATES = {
@@ -37,28 +39,26 @@ STATES = {
 
 def parameters(states):
     """Of the encoder, biases and all, so that an empty grid has features too."""
-    params = StateEncoder().init(jax.random.key(0), states)
-    leaves, tree = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    moved = [x + 0.1 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
-    return tree.unflatten(moved)
+    return drawn(StateEncoder().init, states)
 
 
 @pytest.mark.parametrize("name", STATES)
 def test_known_states_have_the_features_and_gradients_of_states_given(name):
     states, encoder = STATES[name], StateEncoder()
-    cotangent = jax.random.normal(jax.random.key(2), (len(states), 128))
+    cotangent = np.random.default_rng(2).normal(size=(len(states), 128)).astype(np.float32)
 
-    def gradient(states):
+    def gradient(params, states):
         def loss(params):
             features = encoder.apply(params, states)
             return (features * cotangent).sum(), features
 
-        return jax.grad(loss, has_aux=True)
+        return jax.grad(loss, has_aux=True)(params)
 
-    params = parameters(states)
-    expected = jax.jit(gradient(states))(params)
-    known = jax.jit(gradient(np.asarray(states)))(params)
+    @jax.jit
+    def both(params, given):
+        return gradient(params, given), gradient(params, np.asarray(states))
+
+    expected, known = both(parameters(states), np.asarray(states))
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), known, expected
     )
@@ -83,7 +83,7 @@ def test_sums_by_state_leave_out_what_fills_up():
     states = SparseStates(np.array([[0], [0]]), np.array([[0.0], [1.0]]), (1, 4, 4))
     encoder = StateEncoder().bind(parameters(jnp.zeros((1, 1, 4, 4))))
     places = lit_places(states, encoder.conv1.patches, encoder.conv2.patches)
-    ones = jnp.ones((*places.state.shape, 3))
+    ones = np.ones((*places.state.shape, 3), np.float32)
     lit = (places.state == 1).sum()
     np.testing.assert_array_equal(sum_by_state(ones, places), [[0] * 3, [lit] * 3])
 
