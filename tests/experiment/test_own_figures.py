@@ -7,6 +7,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from drawn import drawn_parameters
 
 from sumajax.cli import evaluate as program
 from sumajax.environments import PredatorPrey, TrafficJunction
@@ -26,7 +27,7 @@ EPISODES = 16
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A toy run's directory, summary and table."""
-    learner = LearnerConfig(num_envs=200, rollout_length=20)
+    learner = LearnerConfig(num_envs=100, rollout_length=20)
     experiment = Experiment(
         stages=(
             Stage("source", StateUpsampled(SMALL, 14), 1, learner=learner),
@@ -94,6 +95,7 @@ def test_sumajax_evaluate_shows_them(run, tmp_path, capsys):
 def test_a_domain_without_any_is_as_it_was():
     env = PredatorPrey(size=3, num_predators=2, max_steps=4)
     policy = make_policy("iric", env, hidden=4, encoder="linear")
-    result = evaluate(env, policy, policy.init(jax.random.key(0)), jax.random.key(1), episodes=4)
+    params = drawn_parameters(policy)
+    result = evaluate(env, policy, params, jax.random.key(1), episodes=4)
     assert result.measured.shape == (4, 0, 2)
     assert result.figures(env) == {}

@@ -12,7 +12,7 @@ from experiments.scaling.program import Options, run
 from experiments.scaling.results import Results
 from experiments.scaling.runs import study_runs
 from sumajax.environments import PredatorPrey
-from sumajax.learning import LearnerConfig
+from sumajax.learning import LearnerConfig, config
 from sumajax.upsampling import StateUpsampled
 
 LEARNER = LearnerConfig(num_envs=100, rollout_length=20, scale_by_size=False)
@@ -32,6 +32,7 @@ EPISODES = 16
 @pytest.fixture
 def options(monkeypatch, tmp_path):
     monkeypatch.setattr(Options, "studies", [TOY])
+    monkeypatch.setattr(config, "EPOCH_STEPS", 2_000)  # one update of the toy's
     monkeypatch.setattr(runs, "limits", lambda task: (task.max_steps // 2, task.max_steps))
     return Options(output=tmp_path / "results", runs=tmp_path / "runs")
 
@@ -40,7 +41,7 @@ def test_from_training_to_tables_and_nothing_twice(options, monkeypatch):
     run(options, EPISODES)
     results = Results.read(options.output)
     assert [row["stage"] for row in results.rows["stages"]] == ["3x3", "6x6", "scratch"]
-    assert [row["env_steps"] for row in results.rows["stages"]] == [20_000, 20_000, 40_000]
+    assert [row["env_steps"] for row in results.rows["stages"]] == [2_000, 2_000, 4_000]
     assert {row["after"] for row in results.rows["stages"]} == {"", "3x3"}
     assert all(row["cpu_seconds"] > 0 for row in results.rows["curves"])
     played = results.rows["held_out"]
