@@ -4,12 +4,13 @@ import json
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from drawn import drawn_parameters
 from jax import export
 from refusals import refusal
 
@@ -56,12 +57,13 @@ print(sorted({name.split(".")[0] for name in sys.modules} & {"jax", "sumajax", "
 
 def agent_of(name, env, **settings):
     policy = make_policy(name, env, **settings)
-    return Agent(env, policy, jax.jit(policy.init)(key_of(0)))
+    return Agent(env, policy, drawn_parameters(policy))
 
 
-def seen_by(env):
-    states = jax.vmap(env.reset)(jax.random.split(key_of(1), TEAMS))
-    return jax.vmap(env.observe)(states)
+def seen_by(env, teams=TEAMS):
+    """What so many teams see at the start of an episode."""
+    keys = jax.random.split(key_of(1), teams)
+    return jax.jit(jax.vmap(lambda key: env.observe(env.reset(key))))(keys)
 
 
 @pytest.mark.parametrize(
@@ -88,15 +90,18 @@ def test_an_agent_acts_in_a_program_without_the_package(name, env, tmp_path):
 
 
 def assert_it_is_what_the_agent_does(agent, obs, found):
-    values, act = jax.jit(agent.policy.apply_with), jax.jit(agent.act)
+    @jax.jit
+    def played(carry, obs, key, greedy):
+        noise = agent.policy.sample_noise(key, obs.view.shape[:1], greedy)
+        value = agent.policy.apply_with(agent.params, carry, obs, noise)[1].value
+        return *agent.act(carry, obs, key, greedy=greedy), value
+
     for mode in ("sampled", "greedy"):
         for teams in (1, TEAMS):
             few, carry = jax.tree.map(lambda x, n=teams: x[:n], obs), agent.initial_carry((teams,))
             for time in range(STEPS):
-                greedy, key = mode == "greedy", jax.random.key(time)
-                noise = agent.policy.sample_noise(key, (teams,), greedy)
-                value = values(agent.params, carry, few, noise)[1].value
-                carry, action = act(carry, few, key, greedy=greedy)
+                key, greedy = jax.random.key(time), mode == "greedy"
+                carry, action, value = played(carry, few, key, greedy)
                 name = f"{mode} {teams} {time}"
                 np.testing.assert_array_equal(found[f"{name} actions"], action)
                 np.testing.assert_allclose(found[f"{name} values"], value, rtol=1e-4, atol=1e-5)
@@ -149,7 +154,7 @@ def test_a_team_that_comes_and_goes_is_told_who_is_there(fresh_memory, tmp_path)
     more = {"alive", "entered"} if fresh_memory else {"alive"}
     assert set(card["inputs"]["observation"]) == {"state", "view"} | more
     assert card["inputs"]["observation"]["alive"]["shape"] == ["b", env.num_agents]
-    obs = jax.tree.map(lambda x: x[None], env.observe(env.reset(key_of(1))))
+    obs = seen_by(env, teams=1)
     step = export.deserialize((tmp_path / "team" / "step.bin").read_bytes()).call
     first = agent.initial_carry((1,))
     carry = {"h": first.h + 1, "s": first.s + 1, "gate": first.gate}
@@ -157,7 +162,7 @@ def test_a_team_that_comes_and_goes_is_told_who_is_there(fresh_memory, tmp_path)
     seen = {name: seen[name] for name in card["inputs"]["observation"]}
     obs, key = obs.replace(entered=obs.alive), jax.random.key(3)
     after, _ = step(carry, seen, jax.random.key_data(key), np.bool_(False))
-    expected, _ = agent.act(first.replace(h=carry["h"], s=carry["s"]), obs, key)
+    expected, _ = jax.jit(agent.act)(first.replace(h=carry["h"], s=carry["s"]), obs, key)
     for name in carry:
         np.testing.assert_allclose(after[name], getattr(expected, name), rtol=1e-4, atol=1e-6)
 
@@ -197,11 +202,11 @@ def read_back(function, *arguments):
 def test_a_policy_step(name):
     """Carry, observation and output are the records they were."""
     policy = make_policy(name, ENV)
-    params = jax.jit(policy.init)(key_of(0))
-    carry, obs = policy.initial_carry(), ENV.observe(ENV.reset(key_of(1)))
-    noise = policy.sample_noise(key_of(2), ())
+    params, carry = drawn_parameters(policy), policy.initial_carry()
+    obs = jax.tree.map(lambda x: x[0], seen_by(ENV))
+    noise = jax.jit(partial(policy.sample_noise, batch_shape=()))(key_of(2))
     again = read_back(policy.apply_with, params, carry, obs, noise)
-    expected = policy.apply_with(params, carry, obs, noise)
+    expected = jax.jit(policy.apply_with)(params, carry, obs, noise)
     found = again.call(params, carry, obs, noise)
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     jax.tree.map(
@@ -210,6 +215,6 @@ def test_a_policy_step(name):
 
 
 def test_a_step_of_the_task():
-    state, actions = ENV.reset(key_of(1)), jnp.zeros(ENV.num_agents, jnp.int32)
+    state, actions = jax.jit(ENV.reset)(key_of(1)), np.zeros(ENV.num_agents, np.int32)
     found = read_back(ENV.step, state, actions).call(state, actions)
-    jax.tree.map(np.testing.assert_array_equal, found, ENV.step(state, actions))
+    jax.tree.map(np.testing.assert_array_equal, found, jax.jit(ENV.step)(state, actions))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxpr_as_fun
 
 from sumajax import checkpoint, evaluate, load_agent, make_learner, make_policy, preset
 from sumajax.compat.gymnax import AutoReset
@@ -34,18 +35,18 @@ SAME = [
         "jax_numpy_dtype_promotion": "strict",
         "jax_legacy_prng_key": "error",
         "jax_enable_custom_prng": True,
+        "jax_debug_nans": True,
+        "jax_debug_infs": True,
+        "jax_debug_key_reuse": True,
     },
     {"jax_default_prng_impl": "rbg"},
     {"jax_default_prng_impl": "unsafe_rbg"},
-    {"jax_debug_nans": True, "jax_debug_infs": True},
-    {"jax_debug_key_reuse": True},
     {"jax_check_tracer_leaks": True, "jax_enable_checks": True},
     {"jax_default_matmul_precision": "highest"},
 ]
 """What changes no number, but in the last digits."""
 OTHER = [
-    {"jax_threefry_partitionable": False},
-    {"jax_default_matmul_precision": "bfloat16"},
+    {"jax_threefry_partitionable": False, "jax_default_matmul_precision": "bfloat16"},
     {"jax_default_matmul_precision": "BF16_BF16_F32"},
 ]
 """What asks for other numbers: other random ones, or fewer digits."""
@@ -140,15 +141,19 @@ def test_an_epoch_in_which_no_episode_ended_is_no_error():
 
 
 def test_without_compiling():
-    """Every operation by itself: a few of them, since each waits for its own."""
+    """Every operation by itself; those of the update, of which there are many, are only traced so,
+    each loop and branch written out, and run at once."""
     env = PredatorPrey(size=2, num_predators=2, max_steps=2)
     policy = make_policy("iric", env, hidden=2, encoder="linear")
     learner = make_learner(env, policy, preset("fast", num_envs=2, rollout_length=2))
-    state = learner.init(key_of(0))
+    state = jax.jit(learner.init)(key_of(0))
     expected = jax.jit(learner.update)(state)[0].params
     with set_to({"jax_disable_jit": True}):
-        found = learner.update(state)[0].params
-        assert int(evaluate(env, policy, found, key_of(1), episodes=2).steps_taken.max()) <= 2
+        written_out = jax.make_jaxpr(lambda state: learner.update(state)[0].params)(state)
+        assert int(evaluate(env, policy, expected, key_of(1), episodes=2).steps_taken.max()) <= 2
+    assert not {"jit", "pjit", "scan"} & {step.primitive.name for step in written_out.eqns}
+    leaves = jax.jit(jaxpr_as_fun(written_out))(*jax.tree.leaves(state))
+    found = jax.tree.unflatten(jax.tree.structure(expected), leaves)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), found, expected
     )
@@ -176,7 +181,7 @@ def test_keys_of_another_kind(name):
     """A program may hand over whichever keys it has."""
     policy = make_policy("ic3net", PCP, hidden=4, encoder="linear")
     learner = make_learner(PCP, policy, preset("fast", num_envs=4, rollout_length=5))
-    state = learner.init(jax.random.key(0, impl=name))
+    state = jax.jit(learner.init)(jax.random.key(0, impl=name))
     state, tally = jax.jit(learner.update)(state)
     assert int(tally.env_steps) == 20
     assert jax.random.key_impl(state.key) == name

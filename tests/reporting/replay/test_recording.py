@@ -16,6 +16,8 @@ from sumajax.reporting import record_episode
 from sumajax.reporting import replay as module
 from sumajax.upsampling import StateUpsampled
 
+moved_on_3x3 = jax.jit(lambda agents, actions: move(agents, actions, (3, 3)))
+
 
 @pytest.fixture(scope="module")
 def recorded():
@@ -39,7 +41,7 @@ def test_a_recorded_episode_obeys_the_rules_of_the_task(recorded):
         assert shown.success or shown.num_steps == 30
         assert not (shown.agents == prey)[:-1].all((1, 2)).any()
         for t in range(shown.num_steps):
-            moved = np.asarray(move(shown.agents[t], shown.actions[t], (3, 3)))
+            moved = np.asarray(moved_on_3x3(shown.agents[t], shown.actions[t]))
             still = np.where(shown.reached[t][:, None], shown.agents[t], moved)
             np.testing.assert_array_equal(shown.agents[t + 1], still)
         on_prey = (shown.agents == prey).all(-1)

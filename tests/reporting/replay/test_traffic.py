@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from drawn import drawn_parameters
 from PIL import Image
 
 from sumajax.environments import TrafficJunction
@@ -26,12 +27,13 @@ ACTIONS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 1], [0, 0, 0]])
 
 def episode() -> TrafficEpisode:
     """Two cars collide at the first entry, a third comes; 0 talks and the others hear it."""
-    states, successes = [ENV.reset(jax.random.key(0))], []
+    states, successes = [jax.jit(ENV.reset)(jax.random.key(0))], []
+    step = jax.jit(ENV.step_with)
     for t, actions in enumerate(ACTIONS):
         entry, slot = ARRIVALS.get(t, (None, 0))
-        happens = jnp.array([entry == 0, entry == 1])
-        new = Arrivals(happens, jnp.full(2, slot), jnp.zeros(2, jnp.int32))
-        state, transition = ENV.step_with(states[-1], jnp.asarray(actions), new)
+        happens = np.array([entry == 0, entry == 1])
+        new = Arrivals(happens, np.full(2, slot, np.int32), np.zeros(2, np.int32))
+        state, transition = step(states[-1], actions.astype(np.int32), new)
         states.append(state)
         successes.append(bool(transition.success))
     attention = np.zeros((4, 3, 3))
@@ -97,7 +99,7 @@ def test_a_recorded_episode_is_one_of_the_task():
     task = TrafficJunction(num_cars=2, max_steps=6, arrival_rate=0.7)
     env = StateUpsampled(task, 14)
     policy = make_policy("commnet", env, hidden=4, encoder="linear")
-    params = jax.jit(policy.init)(jax.random.key(0))
+    params = drawn_parameters(policy)
     recorded = record_episode(env, policy, params, jax.random.key(1))
     assert isinstance(recorded, TrafficEpisode)
     assert (recorded.size, recorded.num_steps, recorded.num_agents) == ((7, 7), 6, 2)
