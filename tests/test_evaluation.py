@@ -138,7 +138,8 @@ class TestGreedy:
     def test_greedy_may_be_traced_or_known(self):
         policy, params = tiny_policy()
         agent, carry = Agent(TINY, policy, params), policy.initial_carry()
-        obs, key = TINY.observe(TINY.reset(held_out_keys(FEW)[0])), jax.random.key(0)
+        obs = jax.jit(lambda key: TINY.observe(TINY.reset(key)))(held_out_keys(FEW)[0])
+        key = jax.random.key(0)
         traced = jax.jit(agent.act)
         known = jax.jit(agent.act, static_argnames="greedy")
         for greedy in (False, True):

@@ -5,6 +5,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from drawn import drawn_parameters
 from PIL import Image
 
 from sumajax import checkpoint, load_agent
@@ -23,8 +24,8 @@ FEW = 8
 def save(directory, env, arm, seeds=(0, 4)):
     """A checkpoint of untrained policies, as a stage writes it."""
     policy = make_policy("ic3net", env, hidden=4, encoder="linear")
-    keys = jax.vmap(jax.random.key)(np.array(seeds))
-    state = {"params": jax.jit(jax.vmap(policy.init))(keys)}
+    params = [drawn_parameters(policy, seed) for seed in seeds]
+    state = {"params": jax.tree.map(lambda *leaves: np.stack(leaves), *params)}
     meta = checkpoint.describe(env, policy, arm=arm, seeds=list(seeds), epoch=3)
     return checkpoint.save(directory, state, meta)
 

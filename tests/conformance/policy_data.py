@@ -9,7 +9,7 @@ which the files `policy_alive_*` are meant here) to answer other files.
 
 import os
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ def case_free(name: str) -> str:
     return tail if head[:1] == "c" and head[1:].isdigit() else name
 
 
-@lru_cache(maxsize=64)
+@cache
 def answer(path: Path, dtype: type) -> Arrays:
     """Our value of every recorded result, computed in `dtype` by one program for the file."""
     given = load(path)

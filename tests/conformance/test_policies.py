@@ -14,6 +14,8 @@ from sumajax.policies.layers import straight_through_bit
 OF_THE_LEARNER = "a2c_"
 OF_POLICIES = ("ic3net_", "magic_", "het_", "tarmac_", data.ALIVE)
 PREFIXES = (*OF_POLICIES, OF_THE_LEARNER)
+DRAWN = ("in.graph", "in.bits")
+"""Fields that a core answers too; in a file without them nothing was drawn."""
 TOLERANCE = {np.float64: 1e-9, np.float32: 1e-5}
 RAW_META_TOLERANCE = 1e-4
 """float32 in `het_seq_*`, whose state nodes read raw numbers up to 500 (README section 3.3)."""
@@ -59,10 +61,10 @@ def test_every_recorded_result(path, dtype):
 @each_recording
 def test_the_given_draws_were_used(path):
     """The core drew the recorded graphs and bits exactly, so the results above follow from them."""
-    ours = data.answer(path, np.float32)
-    for name in ours:
-        if name.startswith("in."):
-            np.testing.assert_array_equal(ours[name], data.load(path)[name], err_msg=name)
+    given = {name: y for name, y in data.load(path).items() if name.startswith(DRAWN)}
+    ours = data.answer(path, np.float32) if given else {}
+    for name, value in given.items():
+        np.testing.assert_array_equal(ours[name], value, err_msg=name)
 
 
 @each_recording
