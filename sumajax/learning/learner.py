@@ -165,6 +165,7 @@ class Learner:
     shards: int = 1
     unroll: int = 1
 
+    @partial(jax.jit, static_argnums=0)
     def init(self, key: chex.PRNGKey) -> TrainState:
         """Fresh parameters, optimiser and environments."""
         params_key, train_key = jax.random.split(key)
