@@ -11,12 +11,13 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from beginnings import begin, random_parameters
 from flax import struct
 
 from sumajax.environments.types import Observation, Transition
 from sumajax.learning import make_learner, preset
 from sumajax.learning.rollout import Trajectory, draw, rollout, start
-from sumajax.policies import make_policy
+from sumajax.policies import Policy, make_policy
 
 
 @struct.dataclass
@@ -220,13 +221,13 @@ class OneOf(Probe):
 def learn(
     *probes: Probe,
     policy: str,
-    epochs: int,
-    seeds: int = 3,
+    updates: int,
+    seeds: tuple[int, ...] = (0, 1, 2),
     settings: str = "fast",
     hidden: int = 8,
     **changes: Any,
 ) -> list[Trajectory]:
-    """What the trained teams do, for each probe: leaves (seeds, T, E, N, ...) of 12 x 50 steps.
+    """What teams trained for so many updates do: leaves (seeds, T, E, N, ...) of 12 x 50 steps.
 
     The real learner with a real policy, made small; probes that share one program share all but
     what they show and pay.
@@ -234,21 +235,24 @@ def learn(
     longest = max(probe.max_steps for probe in probes)
     config = preset(settings, policy, **changes)
 
-    def train_and_play(kind: chex.Array, seed: chex.Array) -> Trajectory:
+    def made(env: Any) -> Policy:
+        return make_policy(policy, env, hidden=hidden, encoder="linear")
+
+    def train_and_play(kind: chex.Array, seed: chex.Array, params: Any) -> Trajectory:
         env = probes[0]
         if len(probes) > 1:
             env = OneOf(longest, env.num_agents, probes=probes, kind=kind)
-        learner = make_learner(
-            env, make_policy(policy, env, hidden=hidden, encoder="linear"), config
-        )
+        learner = make_learner(env, made(env), config)
         train_key, start_key, play_key = jax.random.split(jax.random.key(seed), 3)
-        state = learner.init(train_key)
-        state, _ = jax.lax.scan(lambda s, _: learner.epoch(s), state, length=epochs)
+        state = begin(learner, params, train_key)
+        state, _ = jax.lax.scan(lambda s, _: learner.update(s), state, length=updates)
         actors = start(env, learner.policy, jax.random.split(start_key, 50))
         draws = draw(env, learner.policy, jax.random.split(play_key, 50), 12)
         return rollout(env, learner.policy, state.params, actors, draws)[1]
 
-    run = jax.vmap(jax.vmap(train_and_play, (None, 0)), (0, None))
-    played = jax.jit(run)(jnp.arange(len(probes)), jnp.arange(seeds))
+    drawn = [random_parameters(made(probes[0]), seed) for seed in seeds]
+    params = jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
+    run = jax.vmap(jax.vmap(train_and_play, (None, 0, 0)), (0, None, None))
+    played = jax.jit(run)(np.arange(len(probes)), np.array(seeds), params)
     played = jax.tree.map(np.asarray, played)
     return [jax.tree.map(lambda leaf, i=i: leaf[i], played) for i in range(len(probes))]

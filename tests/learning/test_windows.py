@@ -1,6 +1,8 @@
 """Pieces of a segment that can be gone through side by side."""
 
-import jax.numpy as jnp
+from functools import cache
+
+import jax
 import numpy as np
 import pytest
 
@@ -22,26 +24,35 @@ def random_begins(steps: int, gap: int) -> np.ndarray:
     return begins
 
 
-def cases(steps, gap):
+@cache
+def cases(steps: int, gap: int) -> tuple:
+    """Where memory is constant, the windows, and (T, E, 2) numbers as they are, split and joined."""
     begins = random_begins(steps, gap)
-    return begins, windows(jnp.asarray(begins), gap)
+    x = np.random.default_rng(0).normal(size=(steps, ENVS, 2)).astype(np.float32)
+
+    @jax.jit
+    def program(begins, x):
+        pieces = windows(begins, gap)
+        apart = pieces.split({"x": x})["x"]
+        return pieces, apart, pieces.join(apart)
+
+    pieces, apart, joined = jax.tree.map(np.asarray, program(begins, x))
+    return begins, pieces, (x, apart, joined)
 
 
 @pytest.mark.parametrize(("steps", "gap"), SHAPES)
 def test_what_is_joined_is_what_was_split(steps, gap):
-    _, pieces = cases(steps, gap)
-    x = np.random.default_rng(0).normal(size=(steps, ENVS, 2)).astype(np.float32)
-    apart = pieces.split({"x": jnp.asarray(x)})["x"]
+    _, pieces, (x, apart, joined) = cases(steps, gap)
     width, count, _ = pieces.step.shape
     assert apart.shape == (width, count * ENVS, 2)
-    np.testing.assert_array_equal(pieces.join(apart), x)
+    np.testing.assert_array_equal(joined, x)
 
 
 @pytest.mark.parametrize(("steps", "gap"), SHAPES)
 def test_all_that_memory_reaches_is_in_one_window_in_order(steps, gap):
     """From the last step at which memory was constant up to each step."""
-    begins, pieces = cases(steps, gap)
-    step, window, place = map(np.asarray, (pieces.step, pieces.window, pieces.place))
+    begins, pieces, _ = cases(steps, gap)
+    step, window, place = pieces.step, pieces.window, pieces.place
     for env in range(ENVS):
         start = 0
         for t in range(steps):
@@ -54,15 +65,15 @@ def test_all_that_memory_reaches_is_in_one_window_in_order(steps, gap):
 
 @pytest.mark.parametrize(("steps", "gap"), SHAPES)
 def test_every_window_starts_where_memory_is_constant(steps, gap):
-    begins, pieces = cases(steps, gap)
-    first = np.asarray(pieces.step[0])
-    used = np.asarray([(pieces.window == k).any(0) for k in range(len(first))])
+    begins, pieces, _ = cases(steps, gap)
+    first = pieces.step[0]
+    used = np.array([(pieces.window == k).any(0) for k in range(len(first))])
     assert begins[first, np.arange(ENVS)][used].all()
     assert used[0].all()
 
 
 def test_windows_are_some_gaps_long_and_one_more_for_the_overlap():
     """What is gone through twice is less than a gap per window."""
-    _, pieces = cases(699, 10)
+    _, pieces, _ = cases(699, 10)
     width, count, _ = pieces.step.shape
     assert (width, count) == (GAPS_IN_WINDOW * 10 + 9, -(-699 // (GAPS_IN_WINDOW * 10)))
