@@ -5,14 +5,14 @@ than the update that a test is about. What `init` does itself is checked in test
 """
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import chex
 import jax
 import numpy as np
 
-from sumajax.learning import Learner
+from sumajax.learning import Learner, parallel
 from sumajax.learning.learner import TrainState
 from sumajax.policies import Policy
 
@@ -44,3 +44,15 @@ def begun(learner: Learner, seed: int = 0) -> TrainState:
     """`begin` with `random_parameters`, compiled."""
     params = random_parameters(learner.policy, seed)
     return jax.jit(begin, static_argnums=0)(learner, params, jax.random.key(seed))
+
+
+def begun_seeds(learner: Learner, seeds: list[int]) -> TrainState:
+    """`begin` for several seeds, stacked along a leading axis as by `parallel.init_seeds`."""
+    drawn = [random_parameters(learner.policy, seed) for seed in seeds]
+    params = jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
+    return _begin_all(learner, params, parallel.seed_keys(seeds))
+
+
+@partial(jax.jit, static_argnums=0)
+def _begin_all(learner: Learner, params: Any, keys: chex.PRNGKey) -> TrainState:
+    return jax.vmap(partial(begin, learner))(params, keys)

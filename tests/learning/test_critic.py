@@ -1,17 +1,18 @@
 """A critic of its own: shown the true state, sharing nothing with the policy."""
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from beginnings import begun
 from probes import LastStepReward, Probe, ProbeState
 from trajectories import TINY_TASK, tiny_learner
 
 from sumajax.environments import PredatorCapturePrey, PredatorPrey
-from sumajax.learning import make_learner, parallel, preset
+from sumajax.learning import make_learner, preset
 from sumajax.learning.critic import init_critic, shown, values
 from sumajax.learning.rollout import start
 from sumajax.policies import make_policy
@@ -19,7 +20,7 @@ from sumajax.policies.ic3net import IC3Net
 from sumajax.policies.types import PolicyModule
 from sumajax.upsampling import StateUpsampled
 
-SHORT_EPOCH = {"num_envs": 200, "rollout_length": 20, "critic": "state"}  # 5 updates
+SHORT = {"num_envs": 20, "rollout_length": 10, "critic": "state"}  # 100 updates an epoch
 
 
 @dataclass(frozen=True)
@@ -33,56 +34,59 @@ class HiddenCue(LastStepReward):
         return jnp.stack([state.cue, state.time]).astype(jnp.float32)[None]
 
 
-def trained(epochs=1, policy="ic3net", **changes):
-    """A tiny learner, its start and what came of it."""
-    learner = tiny_learner(TINY_TASK, policy, **SHORT_EPOCH, **changes)
-    start = jax.jit(learner.init)(jax.random.key(0))
-    return start, *learner.train(start, epochs)
+@cache
+def updated(policy="ic3net", **changes):
+    """A tiny learner's start, the state after an update, and the compiled update."""
+    learner = tiny_learner(TINY_TASK, policy, **SHORT, **changes)
+    start, update = begun(learner), jax.jit(learner.update)
+    return start, update(start)[0], update
 
 
 def moved(before, after):
-    return any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (before, after)), strict=True))
+    return any(
+        (np.asarray(a) != b).any()
+        for a, b in zip(*map(jax.tree.leaves, (before, after)), strict=True)
+    )
 
 
 class TestWhatItLearns:
     @pytest.mark.parametrize("policy", ["ic3net", "hetnet"])
     def test_its_error_never_reaches_the_policy(self, policy):
-        start, end, _ = trained(policy=policy, policy_weight=0.0, entropy_weight=0.0)
+        start, end, _ = updated(policy, policy_weight=0.0, entropy_weight=0.0)
         assert not moved(start.params, end.params)
         assert moved(start.critic.params, end.critic.params)
 
     def test_the_policy_does_not_learn_from_its_own_value_any_more(self):
-        start, end, _ = trained()
+        start, end, _ = updated()
         core = [tree["params"]["core"] for tree in (start.params, end.params)]
         assert moved(*(tree["action"] for tree in core))
         assert not moved(*(tree["value"] for tree in core))
 
     def test_alone_at_first(self):
-        start, middle, _ = trained(critic_epochs=1)
+        start, middle, update = updated(critic_epochs=1)
         assert not moved(start.params, middle.params)
         assert moved(start.critic.params, middle.critic.params)
-        learner = tiny_learner(TINY_TASK, "ic3net", critic_epochs=1, **SHORT_EPOCH)
-        end, _ = learner.train(middle, 1)
+        end, _ = update(middle.replace(updates=jnp.int32(100)))
         assert moved(start.params, end.params)
 
     def test_it_knows_what_no_agent_sees(self):
         env = HiddenCue()
         config = preset("fast", "iric", critic="state", num_envs=50)
         learner = make_learner(env, make_policy("iric", env, hidden=4, encoder="linear"), config)
-        state, _ = learner.train(jax.jit(learner.init)(jax.random.key(0)), 5)
+        state, _ = learner.train(begun(learner), 5)
         cue, time = jnp.array([0, 0, 1, 1]), jnp.array([0, 1, 0, 1])
         actors = state.actors.replace(
             env_state=ProbeState(cue, time), carry=learner.policy.initial_carry((4,))
         )
-        found = values(env, learner.policy, state.critic.params, actors)
+        found = jax.jit(partial(values, env, learner.policy))(state.critic.params, actors)
         expected = [[0.0], [0.0], [config.gamma], [1.0]]
         np.testing.assert_allclose(found, expected, atol=0.05)
 
     def test_what_the_learner_did_without_it_stays(self):
         """The policy and its environments start as they do with the policy's own critic."""
-        start, *_ = trained()
-        own = tiny_learner(TINY_TASK, "ic3net", **{**SHORT_EPOCH, "critic": "policy"})
-        theirs = jax.jit(own.init)(jax.random.key(0))
+        judged = tiny_learner(TINY_TASK, **SHORT)
+        own = tiny_learner(TINY_TASK, **{**SHORT, "critic": "policy"})
+        start, theirs = jax.jit(lambda key: (judged.init(key), own.init(key)))(jax.random.key(0))
         assert theirs.critic is None
         jax.tree.map(np.testing.assert_array_equal, start.params, theirs.params)
         jax.tree.map(np.testing.assert_array_equal, start.actors, theirs.actors)
@@ -94,14 +98,20 @@ class TestValues:
     def test_of_all_agents_from_the_true_state_and_what_they_remember(self, policy, classes):
         env = PredatorCapturePrey(4, *classes) if classes[1] else PredatorPrey(4, classes[0])
         made = make_policy(policy, env)
-        actors = start(env, made, jax.random.split(jax.random.key(0), 6))
-        params = init_critic(env, made, actors, jax.random.key(1)).params
-        found = values(env, made, params, actors)
+
+        @jax.jit
+        def judged(keys):
+            """Six teams, the third of them alone, and the six if all they remember is ones."""
+            actors = start(env, made, keys)
+            params = init_critic(env, made, actors, jax.random.key(1)).params
+            one = jax.tree.map(lambda x: x[2:3], actors)
+            remembering = actors.replace(carry=jax.tree.map(jnp.ones_like, actors.carry))
+            return [values(env, made, params, x) for x in (actors, one, remembering)]
+
+        found, alone, remembering = map(np.asarray, judged(jax.random.split(jax.random.key(0), 6)))
         assert found.shape == (6, 3)
-        one = jax.tree.map(lambda x: x[2:3], actors)
-        np.testing.assert_allclose(values(env, made, params, one)[0], found[2], rtol=1e-6)
-        remembering = actors.replace(carry=jax.tree.map(jnp.ones_like, actors.carry))
-        assert (values(env, made, params, remembering) != found).all()
+        np.testing.assert_allclose(alone[0], found[2], rtol=1e-6)
+        assert (remembering != found).all()
 
     def test_a_policy_that_does_not_say_what_it_remembers_is_judged_by_the_state(self):
         env = PredatorPrey(size=4, num_predators=3)
@@ -114,8 +124,7 @@ class TestValues:
 
     def test_the_same_parameters_judge_any_team_and_grid(self):
         learners = [
-            tiny_learner(env, **SHORT_EPOCH)
-            for env in (TINY_TASK, PredatorPrey(size=6, num_predators=5))
+            tiny_learner(env, **SHORT) for env in (TINY_TASK, PredatorPrey(size=6, num_predators=5))
         ]
         shapes = [
             jax.tree.map(jnp.shape, jax.eval_shape(learner.init, jax.random.key(0)).critic)
@@ -169,14 +178,3 @@ class TestErrors:
     def test_unknown(self):
         with pytest.raises(ValueError, match="critic 'central' is unknown; choose one of policy, "):
             preset("fast", critic="central")
-
-
-def test_several_seeds_are_each_alone():
-    learner = tiny_learner(TINY_TASK, **SHORT_EPOCH)
-    mesh = parallel.make_mesh(2, 200, devices=1)
-    states = parallel.place(parallel.init_seeds(learner, [0, 5]), mesh)
-    states, _ = parallel.make_train(learner, mesh, epochs=1)(states)
-    close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
-    for i, seed in enumerate([0, 5]):
-        alone, _ = learner.train(jax.jit(learner.init)(jax.random.key(seed)), 1)
-        jax.tree.map(close, alone.critic, jax.tree.map(lambda x, i=i: x[i], states.critic))

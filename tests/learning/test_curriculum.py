@@ -1,6 +1,7 @@
 """Tasks that become harder while they are learnt: which episodes are of which epoch."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import chex
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from beginnings import begin, begun, random_parameters
 from flax import struct
 from probes import Probe, ProbeState
 from trajectories import tiny_learner
@@ -62,7 +64,9 @@ def in_epoch(learner, state, epoch):
 def test_an_episode_is_of_the_epoch_in_which_it_began(whole):
     """Two steps an update of episodes of three: those under way keep what they began with."""
     learner = tiny_learner(Lessons(), num_envs=10, rollout_length=2, whole_episodes=whole)
-    update, state = jax.jit(learner.update), jax.jit(learner.init)(jax.random.key(0))
+    # The environments are at staggered ages, unless every update starts them afresh.
+    init, params = jax.jit(learner.init_from), random_parameters(learner.policy)
+    update, state = jax.jit(learner.update), init(params, jax.random.key(0))
     assert set(np.asarray(state.actors.env_state.lesson)) == {LESSONS[0]}
     state = in_epoch(learner, state, 1)
     under_way = np.asarray(state.actors.env_state.time)
@@ -82,7 +86,7 @@ def test_an_episode_is_of_the_epoch_in_which_it_began(whole):
 def test_training_goes_from_lesson_to_lesson():
     """What an epoch's episodes are paid says which lesson they were; the last one stays."""
     learner = tiny_learner(Lessons(), num_envs=200, rollout_length=20, whole_episodes=True)
-    _, metrics = learner.train(jax.jit(learner.init)(jax.random.key(0)), 4)
+    _, metrics = learner.train(begun(learner), 4)
     expected = [Lessons.max_steps * lesson for lesson in (*LESSONS, LESSONS[-1])]
     np.testing.assert_allclose(metrics.episode_return, expected)
 
@@ -90,7 +94,7 @@ def test_training_goes_from_lesson_to_lesson():
 def test_a_run_that_is_stopped_goes_on_with_its_lesson():
     """The state of training knows its epoch."""
     learner = tiny_learner(Lessons(), num_envs=200, rollout_length=20)
-    state = jax.jit(learner.init)(jax.random.key(0))
+    state = begun(learner)
     whole, _ = learner.train(state, 2)
     first, _ = learner.train(state, 1)
     resumed, _ = learner.train(first, 1)
@@ -101,14 +105,14 @@ def test_a_run_that_is_stopped_goes_on_with_its_lesson():
 def test_evaluation_plays_what_training_leads_to(wrapped):
     env: Any = StateUpsampled(Lessons(), (1, 4)) if wrapped else Lessons()
     policy = make_policy("iric", env, encoder="linear", hidden=4)
-    params = policy.init(jax.random.key(0))
+    params = random_parameters(policy)
     result = evaluate(env, policy, params, jax.random.key(1), episodes=3)
     np.testing.assert_array_equal(result.episode_return, [Lessons.max_steps * GOAL] * 3)
 
 
 def test_a_wrapped_task_is_learnt_in_lessons_too():
     learner = tiny_learner(StateUpsampled(Lessons(), (1, 4)), num_envs=200, rollout_length=20)
-    state = in_epoch(learner, jax.jit(learner.init)(jax.random.key(0)), 2)
+    state = in_epoch(learner, begun(learner), 2)
     state, _ = jax.jit(learner.update)(state)
     assert set(np.asarray(state.actors.env_state.lesson)) == {LESSONS[2]}
 
@@ -121,7 +125,7 @@ def test_the_junctions_rate_is_that_of_the_epoch():
     )
     policy = make_policy("iric", env, encoder="linear", hidden=4)
     learner = make_learner(env, policy, preset("fast", "iric", num_envs=10))
-    update, state = jax.jit(learner.update), jax.jit(learner.init)(jax.random.key(0))
+    update, state = jax.jit(learner.update), begun(learner)
     published = {0: 0.1, 250: 0.1, 298: 0.1, 299: 0.11, 1149: 0.28, 1200: 0.29, 1300: 0.29}
     for epoch, rate in {**published, 50_000: 0.29}.items():
         following, _ = update(in_epoch(learner, state, epoch))
@@ -141,7 +145,8 @@ def test_nothing_is_computed_for_a_task_that_stays_as_it_is():
     def program(env):
         policy = make_policy("iric", env, encoder="linear", hidden=4)
         learner = make_learner(env, policy, preset("fast", "iric", num_envs=10))
-        state = jax.eval_shape(learner.init, jax.random.key(0))
+        params, key = random_parameters(policy), jax.random.key(0)
+        state = jax.eval_shape(partial(begin, learner), params, key)
         return jax.jit(learner.update).lower(state).compile().cost_analysis()
 
     assert program(tasks[0]) == program(tasks[1])

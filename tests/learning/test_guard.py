@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from beginnings import begin, random_parameters
 from probes import MatchView
 from trajectories import tiny_learner
 
@@ -41,7 +42,7 @@ def runs():
 
     def one(harm):
         learner = Harmed(base.env, base.policy, base.config, harm=harm)
-        state = learner.init(jax.random.key(0))
+        state = begin(learner, random_parameters(base.policy), jax.random.key(0))
         bad_memory = jax.tree.map(lambda x: x + jnp.where(harm == 5, NAN, 0), state.opt_state)
         state = state.replace(opt_state=bad_memory)
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from beginnings import begin, begun, random_parameters
 from probes import MatchView
 from trajectories import random_trajectory
 
@@ -127,17 +128,23 @@ def test_each_environment_is_clipped_alone():
     whole = make_learner(env, policy, config)
     unclipped = replace(config, num_envs=1, max_grad_norm=None, clip_per_env=False)
     alone = make_learner(env, policy, unclipped)
-    state = jax.jit(whole.init)(jax.random.key(0))
-    actors, draws = whole._inputs(state)
+
+    @jax.jit
+    def gradient(state):
+        inputs = whole._inputs(state)
+        return inputs, whole._gradient(whole._weights(state), *inputs, state.updates)
+
+    state = begun(whole)
+    (actors, draws), (ours, (_, tally)) = jax.tree.map(np.asarray, gradient(state))
     weights = whole._weights(state)
-    ours, (_, tally) = jax.jit(whole._gradient)(weights, actors, draws, state.updates)
     of_one = jax.jit(alone._gradient)
     parts = []
     for e in range(config.num_envs):
         lane = jax.tree.map(lambda x, e=e: x[e : e + 1], actors)
         lane_draws = jax.tree.map(lambda x, e=e: x[:, e : e + 1], draws)
-        parts.append(of_one(weights, lane, lane_draws, state.updates)[0])
-    norms = [float(jnp.sqrt(sum((g**2).sum() for g in jax.tree.leaves(part)))) for part in parts]
+        alone_gradient, _ = of_one(weights, lane, lane_draws, state.updates)
+        parts.append(jax.tree.map(np.asarray, alone_gradient))
+    norms = [float(np.sqrt(sum((g**2).sum() for g in jax.tree.leaves(part)))) for part in parts]
     assert max(norms) > config.max_grad_norm, "nothing to clip"
     scales = [min(1.0, config.max_grad_norm / norm) for norm in norms]
     expected = jax.tree.map(lambda *g: sum(s * x for s, x in zip(scales, g, strict=True)), *parts)
@@ -172,8 +179,8 @@ def test_an_update_of_hetnet_as_published(env):
     policy = make_policy("hetnet", env, encoder="linear")
     config = preset("paper", "hetnet", num_envs=2, rollout_length=4)
     learner = make_learner(env, policy, config)
-    run = jax.jit(lambda key: learner.update(learner.init(key)))
-    state, tally = run(jax.random.key(0))
+    run = jax.jit(lambda params, key: learner.update(begin(learner, params, key)))
+    state, tally = run(random_parameters(policy), jax.random.key(0))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.params))
     assert int(tally.episodes) >= config.num_envs
     assert int(tally.env_steps) >= config.num_envs * config.rollout_length

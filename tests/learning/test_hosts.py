@@ -71,9 +71,9 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def on_devices(cache, tmp_path_factory):
-    """Directories of checkpoints by layout: "1-2" began on one device and went on with two."""
+    """Directories of checkpoints by layout: "1-4" began on one device and went on with four."""
     root = tmp_path_factory.mktemp("layouts")
-    layouts = {"1": (1, 1), "2": (2, 2), "4": (4, 4), "1-2": (1, 2), "2-1": (2, 1)}
+    layouts = {"1": (1, 1), "4": (4, 4), "1-4": (1, 4), "4-1": (4, 1)}
     stages = [
         [str(root / name), devices, epochs]
         for name, spread in layouts.items()
@@ -83,7 +83,7 @@ def on_devices(cache, tmp_path_factory):
     return {name: root / name for name in layouts}
 
 
-@pytest.mark.parametrize("layout", ["2", "4", "1-2", "2-1"])
+@pytest.mark.parametrize("layout", ["4", "1-4", "4-1"])
 def test_the_same_parameters_on_any_number_of_devices(on_devices, layout):
     assert difference(saved(on_devices["1"]), saved(on_devices[layout])) < 1e-5
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from beginnings import begin, begun, random_parameters
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -17,7 +18,7 @@ from sumajax.environments import PredatorCapturePrey, PredatorPrey
 from sumajax.learning import Learner, make_learner, preset
 from sumajax.learning.learner import mean_of, summarise, tally_of, until_episode_end
 from sumajax.learning.losses import LossParts, estimate_advantages, policy_gradient
-from sumajax.learning.rollout import last_value, rollout, start
+from sumajax.learning.rollout import last_value, rollout
 from sumajax.policies import make_policy
 from sumajax.policies.ic3net import IC3Net
 
@@ -82,7 +83,7 @@ class TestCompilation:
     def test_functions_of_the_task_are_traced_a_fixed_number_of_times(self):
         """However many steps, environments, updates and epochs there are."""
         counted = tiny_learner(Counting(max_steps=2), **SHORT_EPOCH)
-        state = counted.init(jax.random.key(0))
+        state = begun(counted)
         Counting.views = 0
         state, _ = counted.train(state, 2)
         traced = Counting.views
@@ -116,21 +117,25 @@ class TestGradient:
             assert config.mask_inactive
             assert config.team_reward > 0
             assert config.advantages == "centred"
-            params, actors, draws, _ = in_float64(jax.jit(partial(gradient_inputs, tiny))())
-            weights = {"policy": params, "critic": None}
-            ours, (_, tally) = jax.jit(tiny._gradient)(weights, actors, draws, jnp.int32(0))
-            ours = ours["policy"]
-            following, now = jax.jit(partial(rollout, env, tiny.policy))(params, actors, draws)
-            beyond = last_value(env, tiny.policy, params, following)
-            individual = now.value + estimate_advantages(now, beyond, config)
-            share = config.team_reward
-            target = (1 - share) * individual + share * individual.mean(-1, keepdims=True)
-            better = target - now.value
-            acting = now.active.astype(float)
-            better = better - (acting * better).sum() / acting.sum()
+            params, actors, draws = gradient_inputs(tiny)
 
             @jax.jit
-            def loss(params):
+            def gradient_and_constants(params):
+                """Also what the loss takes as constants: targets, advantages and who acts."""
+                weights = {"policy": params, "critic": None}
+                ours, (_, tally) = tiny._gradient(weights, actors, draws, jnp.int32(0))
+                following, now = rollout(env, tiny.policy, params, actors, draws)
+                beyond = last_value(env, tiny.policy, params, following)
+                individual = now.value + estimate_advantages(now, beyond, config)
+                share = config.team_reward
+                target = (1 - share) * individual + share * individual.mean(-1, keepdims=True)
+                better = target - now.value
+                acting = now.active.astype(float)
+                better = better - (acting * better).sum() / acting.sum()
+                return ours["policy"], tally, now, (target, better, acting)
+
+            @jax.jit
+            def loss(params, target, better, acting):
                 _, seen = rollout(env, tiny.policy, params, actors, draws)
                 everyone = jnp.ones_like(acting)
                 policy, entropy = policy_gradient(seen.decisions, better, everyone, acting)
@@ -138,30 +143,39 @@ class TestGradient:
                 weights = config.value_weight, config.entropy_weight
                 return policy + weights[0] * critic - weights[1] * entropy
 
+            found = jax.tree.map(np.asarray, gradient_and_constants(params))
+            ours, tally, now, constants = found
             assert now.terminated.any()
             assert now.truncated.any()
             assert int(tally.env_steps) == 40
             rng, step = np.random.default_rng(0), 1e-6
             for _ in range(4):
-                direction = jax.tree.map(lambda p: jnp.asarray(rng.normal(size=p.shape)), params)
+                direction = jax.tree.map(lambda p: rng.normal(size=p.shape), params)
                 ahead, behind = (
-                    loss(jax.tree.map(lambda p, d, s=s: p + s * d, params, direction))
+                    loss(jax.tree.map(lambda p, d, s=s: p + s * d, params, direction), *constants)
                     for s in (step, -step)
                 )
                 products = jax.tree.map(lambda g, d: (g * d).sum(), ours, direction)
                 along = sum(jax.tree.leaves(products))
-                np.testing.assert_allclose(along, (ahead - behind) / (2 * step), rtol=1e-5)
+                np.testing.assert_allclose(
+                    along, (float(ahead) - float(behind)) / (2 * step), rtol=1e-5
+                )
 
     def test_the_step_is_the_gradient_over_environment_steps(self):
         """Not over agents: the originals' learning rates are made for a sum over agents."""
         tiny = tiny_learner(
             optimiser="rmsprop", max_grad_norm=None, learning_rate=0.1, **SHORT_EPOCH
         )
-        state = fresh(0).replace(opt_state=make_state(tiny, fresh(0).params))
-        weights = {"policy": state.params, "critic": None}
-        inputs = weights, *tiny._inputs(state), state.updates
-        sums, (_, tally) = jax.jit(tiny._gradient)(*inputs)
-        stepped, _ = jax.jit(tiny.update)(state)
+        state = begun(tiny)
+
+        @jax.jit
+        def gradient_and_step(state):
+            weights = {"policy": state.params, "critic": None}
+            inputs = weights, *tiny._inputs(state), state.updates
+            return tiny._gradient(*inputs), tiny.update(state)
+
+        (sums, (_, tally)), (stepped, _) = gradient_and_step(state)
+        sums = jax.tree.map(np.asarray, sums)
         assert int(tally.env_steps) == 4000
 
         def expected(p, g):
@@ -173,19 +187,21 @@ class TestGradient:
 
 
 def gradient_inputs(tiny):
-    state = tiny.init(jax.random.key(1))
-    return state.params, *tiny._inputs(state), state.updates
+    """Parameters, environments at staggered ages and random numbers, as NumPy's in float64."""
+    params = random_parameters(tiny.policy, 1)
+
+    @jax.jit
+    def drawn(params):
+        return tiny._inputs(tiny.init_from(params, jax.random.key(2)))
+
+    return in_float64((params, *drawn(params)))
 
 
 def in_float64(tree):
     def widened(x):
-        return x.astype(jnp.float64) if x.dtype == jnp.float32 else x
+        return np.asarray(x, np.float64 if x.dtype == jnp.float32 else None)
 
     return jax.tree.map(widened, tree)
-
-
-def make_state(tiny, params):
-    return tiny.init_from(params, jax.random.key(0)).opt_state
 
 
 class TestWholeEpisodes:
@@ -206,10 +222,11 @@ class TestWholeEpisodes:
 
     def test_every_update_starts_afresh_and_ends_with_an_episode(self):
         tiny = tiny_learner(settings="paper", num_envs=4, rollout_length=5)
-        state = tiny.init(jax.random.key(0))
+        state = begun(tiny)
         run = jax.jit(lambda s: (tiny._inputs(s), tiny.update(s)))
         for _ in range(3):
             (actors, draws), (state, tally) = run(state)
+            actors = jax.tree.map(np.asarray, actors)
             assert (actors.env_state.time == 0).all()
             assert not any(leaf.any() for leaf in jax.tree.leaves(actors.carry))
             assert jax.tree.leaves(draws)[0].shape[0] == 5 + TINY_TASK.max_steps - 1
@@ -225,7 +242,8 @@ class TestPresetPaper:
         """HetNet's is in test_hetnet_loss.py."""
         env = PredatorCapturePrey(size=3, num_predators=2, num_capturers=1, max_steps=4)
         tiny = tiny_learner(env, policy, "paper", num_envs=2, rollout_length=4)
-        state, tally = jax.jit(lambda key: tiny.update(tiny.init(key)))(jax.random.key(0))
+        run = jax.jit(lambda params, key: tiny.update(begin(tiny, params, key)))
+        state, tally = run(random_parameters(tiny.policy), jax.random.key(0))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.params))
         assert float(tally.gradient_norm) > 0
         assert int(tally.episodes) >= 2
@@ -256,9 +274,7 @@ class TestFigures:
     def test_no_episode_ended(self):
         """NaN, not a zero that looks like a figure."""
         tiny = tiny_learner(ConstantReward(max_steps=3), num_envs=20_000, rollout_length=1)
-        state = tiny.init(jax.random.key(0))
-        together = start(tiny.env, tiny.policy, jax.random.split(jax.random.key(1), 20_000))
-        _, metrics = tiny.train(state.replace(actors=together), 3)
+        _, metrics = tiny.train(begun(tiny), 3)
         np.testing.assert_array_equal(metrics.episodes, [0, 0, 20_000])
         for name in ("steps_taken", "success", "episode_return"):
             np.testing.assert_array_equal(np.isnan(getattr(metrics, name)), [True, True, False])
@@ -283,15 +299,21 @@ class TestFigures:
         assert (metrics.gradient_norm > 0).all()
 
 
+CRITIC_ALONE = {**SHORT_EPOCH, "critic_epochs": 1, "critic_rate": 0.01, "value_weight": 1.0}
+
+
+@cache
+def held():
+    """A learner, its start, and state and metrics after an epoch of its critic alone."""
+    tiny = tiny_learner(TINY_TASK, "ic3net", **CRITIC_ALONE)
+    return tiny, begun(tiny), *tiny.train(begun(tiny), 1)
+
+
 class TestCriticAlone:
     """The first `critic_epochs`."""
 
-    CONFIG = {**SHORT_EPOCH, "critic_epochs": 1, "critic_rate": 0.01, "value_weight": 1.0}
-
     def test_nothing_that_the_policy_depends_on_changes(self):
-        tiny = tiny_learner(TINY_TASK, "ic3net", **self.CONFIG)
-        state = tiny.init(jax.random.key(0))
-        after, metrics = tiny.train(state, 1)
+        tiny, state, after, metrics = held()
         for is_critic, a, b in zip(
             jax.tree.leaves(tiny.policy.only_critic(state.params)),
             jax.tree.leaves(state.params),
@@ -302,20 +324,19 @@ class TestCriticAlone:
         assert not any(leaf.any() for leaf in jax.tree.leaves(metrics.fault))
 
     def test_the_critic_learns(self):
-        tiny = tiny_learner(ConstantReward(), **{**self.CONFIG, "critic_epochs": 20})
-        _, metrics = tiny.train(tiny.init(jax.random.key(0)), 20)
+        tiny = tiny_learner(ConstantReward(), **{**CRITIC_ALONE, "critic_epochs": 20})
+        _, metrics = tiny.train(begun(tiny), 20)
         assert metrics.value_loss[-1] < 0.01 * metrics.value_loss[0]
 
     def test_then_all_learns_with_fresh_optimiser_memory(self):
-        tiny = tiny_learner(TINY_TASK, "ic3net", **self.CONFIG)
-        held, _ = tiny.train(tiny.init(jax.random.key(0)), 1)
-        after, _ = jax.jit(tiny.update)(held)
+        tiny, state, before, _ = held()
+        after, _ = jax.jit(tiny.update)(before)
         plain = replace(tiny, config=replace(tiny.config, critic_epochs=0))
-        anew = held.replace(opt_state=make_state(plain, held.params))
-        expected, _ = jax.jit(plain.update)(anew)
+        # The memory that a start has is fresh.
+        expected, _ = jax.jit(plain.update)(before.replace(opt_state=state.opt_state))
         close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7)
         jax.tree.map(close, after.params, expected.params)
-        for a, b in zip(*map(jax.tree.leaves, (held.params, after.params)), strict=True):
+        for a, b in zip(*map(jax.tree.leaves, (before.params, after.params)), strict=True):
             assert (a != b).any()
 
     def test_a_policy_that_names_no_critic_learns_as_a_whole(self):
@@ -333,7 +354,8 @@ class TestStart:
     def test_environments_are_at_staggered_ages(self):
         """Every age alike, where all episodes last as long."""
         tiny = tiny_learner(ConstantReward(max_steps=4, terminates=False), **SHORT_EPOCH)
-        actors = tiny.init(jax.random.key(0)).actors
+        start = jax.jit(tiny.init_from)(random_parameters(tiny.policy), jax.random.key(0))
+        actors = jax.tree.map(np.asarray, start.actors)
         ages = np.bincount(actors.env_state.time, minlength=4)
         assert ages.size == 4
         assert ages.min() > 200 / 4 / 2
@@ -345,25 +367,27 @@ class TestStart:
             PredatorPrey(size=4, num_predators=2, max_steps=100),
             **{**SHORT_EPOCH, "learning_rate": 1e-9},
         )
-        _, metrics = tiny.train(tiny.init(jax.random.key(0)), 10)
+        start = jax.jit(tiny.init_from)(random_parameters(tiny.policy), jax.random.key(0))
+        _, metrics = tiny.train(start, 10)
         later = metrics.steps_taken[1:]
         assert abs(metrics.steps_taken[0] - later.mean()) < 4 * later.std()
 
     def test_with_whole_episodes_every_update_starts_afresh_anyway(self):
         tiny = tiny_learner(settings="paper", num_envs=4, rollout_length=5)
-        assert not tiny.init(jax.random.key(0)).actors.env_state.time.any()
+        start = jax.jit(tiny.init_from)(random_parameters(tiny.policy), jax.random.key(0))
+        assert not np.asarray(start.actors.env_state.time).any()
 
     def test_given_parameters_and_memory_are_kept(self):
-        params = jax.tree.map(jnp.ones_like, fresh(0).params)
-        memory = jax.tree.map(jnp.ones_like, fresh(0).opt_state)
-        state = learner().init_from(params, jax.random.key(3), memory)
+        ones = partial(jax.tree.map, lambda x: np.ones(x.shape, x.dtype))
+        params, memory = ones(fresh(0).params), ones(fresh(0).opt_state)
+        state = jax.jit(learner().init_from)(params, jax.random.key(3), memory)
         assert_same(state.params, params)
         assert_same(state.opt_state, memory)
         assert int(state.updates) == 0
 
     def test_memory_is_fresh_unless_given(self):
-        state = learner().init_from(fresh(0).params, jax.random.key(3))
-        assert not any(leaf.any() for leaf in jax.tree.leaves(state.opt_state))
+        state = jax.jit(learner().init_from)(fresh(0).params, jax.random.key(3))
+        assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(state.opt_state))
 
     def test_a_policy_of_another_task_is_refused(self):
         other = make_policy("iric", PredatorPrey(size=4, num_predators=2))

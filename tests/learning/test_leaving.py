@@ -334,9 +334,7 @@ def test_a_loss_that_knows_no_leaving_is_refused():
         make_learner(env, policy, config)
 
 
-@pytest.mark.parametrize(
-    ("policy", "settings"), [("magic", "fast"), ("tarmac-ic3net", "paper")]
-)
+@pytest.mark.parametrize(("policy", "settings"), [("magic", "fast"), ("tarmac-ic3net", "paper")])
 def test_an_update_is_finite(policy, settings):
     env = Rota()
     hidden = {"hidden": 4} if policy != "magic" else {}

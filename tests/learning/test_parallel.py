@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from beginnings import begun_seeds
 from trajectories import TINY_TASK, tiny_learner
 
 from sumajax.learning import parallel
@@ -37,8 +38,8 @@ def raw(leaf):
 
 
 def test_several_seeds_are_each_alone():
-    """In one program, one after the other, as if the others were not there."""
-    learner = tiny_learner(TINY_TASK, num_envs=200, rollout_length=20)
+    """In one program, one after the other, as if the others were not there, nor their critics."""
+    learner = tiny_learner(TINY_TASK, num_envs=200, rollout_length=20, critic="state")
     mesh = parallel.make_mesh(len(SEEDS), 200, devices=1)
     states = parallel.place(parallel.init_seeds(learner, SEEDS), mesh)
     states, metrics = parallel.make_train(learner, mesh, epochs=1)(states)
@@ -59,7 +60,7 @@ def test_seeds_side_by_side_learn_what_they_learn_one_after_the_other(policy):
     mesh = parallel.make_mesh(len(SEEDS), 200, devices=1)
     ways = []
     for together, unroll in ((False, 1), (True, 4)):
-        states = parallel.place(parallel.init_seeds(learner, SEEDS), mesh)
+        states = parallel.place(begun_seeds(learner, SEEDS), mesh)
         way = parallel.Execution(together, unroll)
         ways.append(parallel.make_train(learner, mesh, 1, way)(states))
     close = partial(np.testing.assert_allclose, rtol=1e-3, atol=2e-5)
@@ -79,9 +80,9 @@ def test_a_stage_like_an_earlier_one_is_traced_no_second_time():
     assert parallel.make_train(equal, anew, 1) is train
     assert parallel.make_train(equal, mesh, 2) is not train
     assert parallel.make_train(other, mesh, 1) is not train
-    for learner, compiled in ((first, 1), (equal, 0), (other, 1)):
+    states = jax.eval_shape(partial(begun_seeds, first, [0]))
+    for learner, compiled in ((first, 1), (equal, 0)):
         before = programs_compiled()
-        states = jax.eval_shape(partial(parallel.init_seeds, learner, [0]))
         parallel.compile_train(learner, mesh, 1, states)
         assert programs_compiled() - before == compiled
 
@@ -91,7 +92,7 @@ def test_seeds_side_by_side_share_every_product():
     learner = tiny_learner(TINY_TASK, "ic3net", num_envs=200, rollout_length=20)
     mesh, found = parallel.make_mesh(3, 200, devices=1), []
     for num_seeds, together in ((1, False), (3, True)):
-        states = jax.eval_shape(lambda n=num_seeds: parallel.init_seeds(learner, list(range(n))))
+        states = jax.eval_shape(partial(begun_seeds, learner, list(range(num_seeds))))
         train = parallel.make_train(learner, mesh, 1, parallel.Execution(together))
         program = train.lower(states).as_text()
         products = [line for line in program.splitlines() if "stablehlo.dot_general" in line]

@@ -165,7 +165,7 @@ def one_long_scan(env, policy, params, actors, draws, gap):
 
 @pytest.mark.parametrize(
     "policy",
-    # MAGIC remembers what IC3Net does, an LSTM's state per agent; HetNet one per class and message.
+    # MAGIC remembers what IC3Net does, an LSTM's state for each agent; HetNet two for some.
     ["ic3net", pytest.param("magic", marks=pytest.mark.slow), "hetnet"],
 )
 def test_gradients_are_those_of_one_long_scan_that_cuts_memory(policy):
@@ -184,7 +184,7 @@ def test_gradients_are_those_of_one_long_scan_that_cuts_memory(policy):
         chosen = sum((weight[name][..., None] * x**2).sum() for name, x in logits.items())
         return chosen + (weight["value"] * value).sum()
 
-    def ours(params):
+    def in_pieces(params):
         _, seen = rollout(env, policy, params, actors, draws, gap)
         return weighed({name: d.logits for name, d in seen.decisions.items()}, seen.value)
 
@@ -193,7 +193,7 @@ def test_gradients_are_those_of_one_long_scan_that_cuts_memory(policy):
 
     @jax.jit
     def both(params):
-        return [jax.value_and_grad(objective)(params) for objective in (ours, reference)]
+        return [jax.value_and_grad(objective)(params) for objective in (in_pieces, reference)]
 
     (a, ours), (b, expected) = jax.tree.map(np.asarray, both(params))
     np.testing.assert_allclose(a, b, rtol=1e-4)

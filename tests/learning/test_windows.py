@@ -26,7 +26,7 @@ def random_begins(steps: int, gap: int) -> np.ndarray:
 
 @cache
 def cases(steps: int, gap: int) -> tuple:
-    """Where memory is constant, the windows, and (T, E, 2) numbers as they are, split and joined."""
+    """Where memory is constant, the windows, and (T, E, 2) numbers: themselves, split, joined."""
     begins = random_begins(steps, gap)
     x = np.random.default_rng(0).normal(size=(steps, ENVS, 2)).astype(np.float32)
 

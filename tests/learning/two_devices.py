@@ -7,6 +7,7 @@ import json
 
 import jax
 import numpy as np
+from beginnings import begun_seeds
 from trajectories import TINY_TASK, tiny_learner
 
 from sumajax.learning import parallel
@@ -15,13 +16,13 @@ SEEDS = [0, 1]
 
 
 def trained(learner, seeds, devices):
-    """Figures and parameters after an epoch, a critic's of its own too."""
+    """Parameters and figures after an epoch, and a critic's parameters."""
     mesh = parallel.make_mesh(len(seeds), learner.config.num_envs, devices)
-    states = parallel.place(parallel.init_seeds(learner, seeds), mesh)
+    states = parallel.place(begun_seeds(learner, seeds), mesh)
     train = parallel.compile_train(learner, mesh, 1, states)
     states, metrics = train(states)
-    critic = states.critic and states.critic.params
-    return jax.tree.map(np.asarray, (states.params, critic, metrics)), dict(mesh.shape)
+    found = {"policy": (states.params, metrics), "critic": states.critic.params}
+    return jax.tree.map(np.asarray, found), dict(mesh.shape)
 
 
 def difference(a, b):
@@ -31,15 +32,15 @@ def difference(a, b):
 
 
 def compare():
-    learner = tiny_learner(TINY_TASK, num_envs=200, rollout_length=20, advantages="normalised")
+    """With a critic of its own; that of a policy over devices: test_hosts.py."""
+    settings = {"num_envs": 200, "rollout_length": 20, "advantages": "normalised"}
+    learner = tiny_learner(TINY_TASK, critic="state", **settings)
     together, _ = trained(learner, SEEDS, 1)
     over_seeds, seeds_mesh = trained(learner, SEEDS, 2)
     over_envs, envs_mesh = trained(learner, SEEDS[:1], 2)
     first, second = (jax.tree.map(lambda x, s=s: x[s : s + 1], together) for s in (0, 1))
-    judged = tiny_learner(TINY_TASK, num_envs=200, rollout_length=20, critic="state")
-    alone, shared = (trained(judged, SEEDS[:1], devices)[0] for devices in (1, 2))
     return {
-        "own_critic": difference(alone, shared),
+        "own_critic": difference(first["critic"], over_envs["critic"]),
         "devices": jax.device_count(),
         "seeds_mesh": seeds_mesh,
         "over_seeds": difference(together, over_seeds),
