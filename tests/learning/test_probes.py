@@ -21,7 +21,8 @@ from probes import (
 from sumajax.learning.rollout import Trajectory
 
 GAMMA = 0.5
-SMALL = {"num_envs": 10, "rollout_length": 4, "learning_rate": 2e-2, "gamma": GAMMA}
+# All begin together: five steps, so that a rollout ends within an episode of two as well.
+SMALL = {"num_envs": 10, "rollout_length": 5, "learning_rate": 2e-2, "gamma": GAMMA}
 ALWAYS, CHANCE = 0.95, 0.5
 
 ALONE = {
