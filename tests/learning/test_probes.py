@@ -91,7 +91,7 @@ def test_message(policy):
 
     With seeds 1 and 6 they are closed before there is anything to hear.
     """
-    settings = {**SMALL, "num_envs": 25, "learning_rate": 1e-2}
+    settings = {**SMALL, "num_envs": 25, "rollout_length": 4, "learning_rate": 1e-2}
     (played,) = learn(Tell(max_steps=2), policy=policy, updates=300, seeds=(0, 2, 3), **settings)
     assert (earned(played) > ALWAYS).all()
 
