@@ -11,13 +11,12 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from beginnings import begin, random_parameters
 from flax import struct
 
 from sumajax.environments.types import Observation, Transition
 from sumajax.learning import make_learner, preset
 from sumajax.learning.rollout import Trajectory, draw, rollout, start
-from sumajax.policies import Policy, make_policy
+from sumajax.policies import make_policy
 
 
 @struct.dataclass
@@ -222,7 +221,7 @@ def learn(
     *probes: Probe,
     policy: str,
     updates: int,
-    seeds: tuple[int, ...] = (0, 1, 2),
+    seeds: int = 3,
     settings: str = "fast",
     hidden: int = 8,
     **changes: Any,
@@ -235,24 +234,21 @@ def learn(
     longest = max(probe.max_steps for probe in probes)
     config = preset(settings, policy, **changes)
 
-    def made(env: Any) -> Policy:
-        return make_policy(policy, env, hidden=hidden, encoder="linear")
-
-    def train_and_play(kind: chex.Array, seed: chex.Array, params: Any) -> Trajectory:
+    def train_and_play(kind: chex.Array, seed: chex.Array) -> Trajectory:
         env = probes[0]
         if len(probes) > 1:
             env = OneOf(longest, env.num_agents, probes=probes, kind=kind)
-        learner = make_learner(env, made(env), config)
+        learner = make_learner(
+            env, make_policy(policy, env, hidden=hidden, encoder="linear"), config
+        )
         train_key, start_key, play_key = jax.random.split(jax.random.key(seed), 3)
-        state = begin(learner, params, train_key)
+        state = learner.init(train_key)
         state, _ = jax.lax.scan(lambda s, _: learner.update(s), state, length=updates)
         actors = start(env, learner.policy, jax.random.split(start_key, 50))
         draws = draw(env, learner.policy, jax.random.split(play_key, 50), 12)
         return rollout(env, learner.policy, state.params, actors, draws)[1]
 
-    drawn = [random_parameters(made(probes[0]), seed) for seed in seeds]
-    params = jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
-    run = jax.vmap(jax.vmap(train_and_play, (None, 0, 0)), (0, None, None))
-    played = jax.jit(run)(np.arange(len(probes)), np.array(seeds), params)
+    run = jax.vmap(jax.vmap(train_and_play, (None, 0)), (0, None))
+    played = jax.jit(run)(jnp.arange(len(probes)), jnp.arange(seeds))
     played = jax.tree.map(np.asarray, played)
     return [jax.tree.map(lambda leaf, i=i: leaf[i], played) for i in range(len(probes))]

@@ -21,7 +21,6 @@ from probes import (
 from sumajax.learning.rollout import Trajectory
 
 GAMMA = 0.5
-# All begin together: five steps, so that a rollout ends within an episode of two as well.
 SMALL = {"num_envs": 10, "rollout_length": 5, "learning_rate": 2e-2, "gamma": GAMMA}
 ALWAYS, CHANCE = 0.95, 0.5
 
@@ -89,10 +88,10 @@ def test_action_by_a_state_too_large_to_list():
 def test_message(policy):
     """Agent 1 acts on what only agent 0 saw; with IC3Net both must have opened their gates.
 
-    With seeds 1 and 6 they are closed before there is anything to hear.
+    At the other probes' rate one seed in three closes them before there is anything to hear.
     """
-    settings = {**SMALL, "num_envs": 25, "rollout_length": 4, "learning_rate": 1e-2}
-    (played,) = learn(Tell(max_steps=2), policy=policy, updates=300, seeds=(0, 2, 3), **settings)
+    settings = {**SMALL, "num_envs": 25, "rollout_length": 4, "learning_rate": 3e-3}
+    (played,) = learn(Tell(max_steps=2), policy=policy, updates=1_000, **settings)
     assert (earned(played) > ALWAYS).all()
 
 
