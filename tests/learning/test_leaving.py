@@ -318,7 +318,7 @@ def test_a_learner_values_what_an_agent_earns_itself():
         Relay(),
         policy="tarmac-ic3net",
         updates=600,
-        seeds=(0, 1),
+        seeds=2,
         team_reward=0.0,
         alive_mask="after",
         **small,
