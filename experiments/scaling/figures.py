@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
 from experiments.scaling.costs import Arm
 from experiments.scaling.plans import DIRECT, SCRATCH
@@ -48,7 +48,10 @@ def cost_figure(found: Sequence[Arm], output: Path) -> None:
         sides = sorted({side for by_side in lines.values() for side in by_side})
         axes.xaxis.set_major_locator(FixedLocator(sides))
         axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_minor_locator(NullLocator())
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.set_xlim(min(sides) / 1.2, max(sides) * 1.2)
         axes.set_ylabel(f"{label}\nto {LEVEL:g} x shortest paths", color=INK)
     handles, names = figure.axes[0].get_legend_handles_labels()

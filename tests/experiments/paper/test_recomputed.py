@@ -245,34 +245,43 @@ def evaluated_cells(name, arm):
     return [f"{steps:.1f} M" if steps else "0", *cells]
 
 
-def larger_grid(title):
-    """Of the chain to 40x40: its stage on such a grid, at the task's limit or the one named."""
-    grid, limit = re.match(r"(\d+x\d+), \d+ predators, limit (\d+)", title).groups()
-    own = {"experiment": "pp40-hetnet", "stage": grid}
-    (task,) = {row["task"] for row in read("scale/stages") if own.items() <= row.items()}
-    played = [
-        row
-        for row in read("scale/held_out")
-        if {**own, "task": task, "limit": limit}.items() <= row.items()
-    ]
-    assert {row["episodes"] for row in played} == {"1024"}
+SCRATCH_OF = {"pp40-hetnet": "pp20-hetnet-scratch", "pcp20-hetnet": "pcp20-hetnet-scratch"}
+"""By chain: what has its steps up to the end of its 20x20 stage, on 20x20 alone."""
 
-    def mean(when, mode):
-        rows = [row for row in played if (row["when"], row["mode"]) == (when, mode)]
+
+def larger_grid(title):
+    """Of a chain: its stage on such a grid, at the task's limit or the one named, and scratch."""
+    grid, capturers, limit = re.match(
+        r"(\d+x\d+), \d+ predators( and \d+ capturers)?, limit (\d+)", title
+    ).groups()
+    chain = "pcp20-hetnet" if capturers else "pp40-hetnet"
+    stage = kept("stages", experiment=chain, stage=grid)
+    ((task, trained, bound),) = {(r["task"], r["env_steps"], r["bound"]) for r in stage}
+
+    def mean(experiment, name, when, mode):
+        rows = kept("held_out", experiment=experiment, stage=name, task=task, limit=limit)
+        assert {row["episodes"] for row in rows} <= {"1024"}
+        rows = [row for row in rows if (row["when"], row["mode"]) == (when, mode)]
         steps = [float(row["steps_taken"]) for row in rows]
+        if not steps:
+            return "-"
         success = np.mean([float(row["success"]) for row in rows])
         between = f"{min(steps):.1f}-{max(steps):.1f}"
         return f"{np.mean(steps):.1f} ({between}; {success:.3f})"
 
-    stage = [row for row in read("scale/stages") if own.items() <= row.items()]
-    (trained,), (bound,) = ({row[name] for row in stage} for name in ("env_steps", "bound"))
     return [
         f"{int(trained) / 1e6:.1f} M",
-        mean("zero shot", "sampled"),
-        mean("end", "sampled"),
-        mean("end", "greedy"),
+        mean(chain, grid, "zero shot", "sampled"),
+        mean(chain, grid, "end", "sampled"),
+        mean(chain, grid, "end", "greedy"),
+        mean(SCRATCH_OF[chain], "scratch", "end", "sampled"),
         f"{float(bound):.1f}",
     ]
+
+
+def kept(file, **cells):
+    """Rows of the study of larger grids that have these cells."""
+    return [row for row in read(f"scale/{file}") if cells.items() <= row.items()]
 
 
 TABLES = {
@@ -323,7 +332,7 @@ def test_every_table_is_found():
         "evaluations pp-magic": 4,
         "evaluations pp-hetnet": 6,
         "evaluations pcp": 7,
-        "larger grids": 4,
+        "larger grids": 5,
     }
 
 
