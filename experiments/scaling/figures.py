@@ -150,7 +150,7 @@ def curves_figure(own: Sequence[Arm], output: Path) -> None:
         axes.set_ylim(bottom=0)
     figure.axes[0].set_ylabel(f"steps taken, {target}", color=INK)
     handles, names = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper left", ncols=3, frameon=False, fontsize=8)
+    figure.legend(handles, names, loc="outside upper left", ncols=2, frameon=False, fontsize=8)
     note = "held-out, sampled; mean and range over seeds; dotted: shortest paths"
     figure.supxlabel(note, x=0.995, ha="right", fontsize=8, color=FAINT)
     write_png(figure, output)
