@@ -25,7 +25,7 @@ PP20_EPOCHS = (40, 40, 60)  # 5x5, 10x10, 20x20
 PP40_EPOCHS = (40, 40, 60, 50)  # 5x5, 10x10, 20x20, 40x40
 PCP20_EPOCHS = (50, 50, 75)  # 5x5, 10x10, 20x20
 RECT_EPOCHS = (80, 80)  # 10x20, 20x40
-BRIEF_EPOCHS = (15, 15, 60)  # 5x5, 10x10, 20x20: sources that have just learnt their task
+BRIEF_EPOCHS = (15, 15, 60)  # 5x5, 10x10, 20x20: sources cut short
 STILL_EPOCHS = (100, 100, 150)  # at most, where a stage ends by itself
 EVALUATE_EVERY = 5
 """Epochs between held-out evaluations while a stage trains."""
