@@ -10,14 +10,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
 from experiments.scaling.costs import Arm
-from experiments.scaling.plans import DIRECT, SCRATCH
+from experiments.scaling.plans import SCRATCH
 from experiments.scaling.results import Row
 from sumajax.reporting.curves import FAINT, INK, dress, write_png
 
 LEVEL = 2.0
 """Times the shortest paths, of the figure of costs."""
-PP_PARTS = ("pp10", "pp20", "pp40")
-"""Whose grids are squares, from 5 to 40 cells along a side."""
+COST_PARTS = ("pp10", "pp20", "pp40", "dilution")
+"""Whose chains grow from 5x5 on Predator-Prey, each policy in its own way."""
 AXES = {"env_steps": (1e-6, "environment steps (millions)"), "cpu_seconds": (1.0, "CPU seconds")}
 
 # Okabe and Ito's palette, as in the package's own curves.
@@ -71,15 +71,14 @@ def cost_lines(found: Sequence[Arm]) -> dict[tuple[str, str], dict[int, Arm]]:
     for the others.
     """
     lines: dict[tuple[str, str], dict[int, Arm]] = {}
-    for part in PP_PARTS:
+    for part in COST_PARTS:
         own = [arm for arm in found if arm.about["part"] == part]
         for policy in dict.fromkeys(arm.about["policy"] for arm in own):
             of_policy = [arm for arm in own if arm.about["policy"] == policy]
             scratch = [arm for arm in of_policy if arm.about["stage"] == SCRATCH]
             staged = [arm for arm in of_policy if arm.about["stage"] != SCRATCH]
             first = [arm for arm in staged if not arm.about["after"]]
-            chain = [arm for arm in staged if arm.about["stage"] != DIRECT]
-            chain.sort(key=lambda arm: len(arm.about["after"].split()), reverse=True)
+            chain = sorted(staged, key=lambda arm: len(arm.about["after"].split()), reverse=True)
             ends = {"chain": chain} | ({SCRATCH: first + scratch} if scratch else {})
             for kind, of_kind in ends.items():
                 by_side = lines.setdefault((policy, kind), {})
@@ -89,7 +88,7 @@ def cost_lines(found: Sequence[Arm]) -> dict[tuple[str, str], dict[int, Arm]]:
 
 
 def _style(kind: str) -> Any:
-    return {"chain": "-", SCRATCH: DASHED, DIRECT: DOTTED}[kind]
+    return DASHED if kind == SCRATCH else "-"
 
 
 def _cost_line(
@@ -136,8 +135,7 @@ def curves_figure(own: Sequence[Arm], output: Path) -> None:
         for arm in arms:
             name = _line_name(arm)
             x, low, middle, high = band(arm, place)
-            stage = arm.about["stage"]
-            style = _style(stage) if stage in (SCRATCH, DIRECT) else "-"
+            style = _style(arm.about["stage"])
             axes.plot(
                 x * scale, middle, color=colours[name], linestyle=style, linewidth=1.5, label=name
             )
@@ -158,7 +156,7 @@ def curves_figure(own: Sequence[Arm], output: Path) -> None:
 
 def _line_name(arm: Arm) -> str:
     about = arm.about
-    words = about["words"] if about["stage"] not in (SCRATCH, DIRECT) else about["stage"]
+    words = SCRATCH if about["stage"] == SCRATCH else about["words"]
     return f"{about['policy']}, {words}"
 
 

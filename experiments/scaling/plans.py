@@ -110,8 +110,8 @@ OWN_POLICIES: dict[str, tuple[str, ...]] = {
 
 # --- Stages ------------------------------------------------------------------------------------
 
-SCRATCH, DIRECT = "scratch", "direct"
-"""Stages that are compared with a chain; those of a chain are called by their grids."""
+SCRATCH = "scratch"
+"""The stage that is compared with a chain; those of a chain are called by their grids."""
 
 
 def seen_at(task: Any, target: Any, scale: Scale = SCALE, fill: Fill = "blocks") -> Environment:
@@ -156,16 +156,6 @@ def compared(tasks: Sequence[Any], epochs: Sequence[int], learner: LearnerConfig
     return with_scratch(chain_of(envs, epochs, learner))
 
 
-def pp20(learner: LearnerConfig) -> tuple[Stage, ...]:
-    """The chain, scratch, and from 5x5 at once, with the steps of 10x10 added on 20x20."""
-    stages = compared(PP[:3], PP20_EPOCHS, learner)
-    first, *_, last, scratch = stages
-    on_target = sum(PP20_EPOCHS[1:])
-    direct = Stage(DIRECT, last.env, on_target, first.name, learner)
-    # The chain's last stage is the plan's target, so it has to be the last that is transferred.
-    return (*stages[:-2], direct, last, scratch)
-
-
 # --- Rivals on 20x20, each with the steps of the chain ------------------------------------------
 
 
@@ -190,6 +180,11 @@ def _upsampled(scale: Scale, fill: Fill = "blocks", **later: Any) -> Any:
         return chain_of(envs, PP20_EPOCHS, learner, **later)
 
     return stages
+
+
+def _direct(learner: LearnerConfig) -> tuple[Stage, ...]:
+    envs = [seen_at(task, PP[2]) for task in (PP[0], PP[2])]
+    return chain_of(envs, (PP20_EPOCHS[0], sum(PP20_EPOCHS[1:])), learner)
 
 
 def _native(resize: Resize | None = None) -> Any:
@@ -220,6 +215,7 @@ def _grid_alone(learner: LearnerConfig) -> tuple[Stage, ...]:
 
 
 RIVALS: dict[str, Rival] = {
+    "direct": Rival("upsampled, from 5x5 to 20x20 at once", _direct),
     "none": Rival("upsampled, state scale `none` (the paper)", _upsampled("none")),
     "coordinates": Rival(
         "coordinates through Fourier features", _native(), {"encoder": "coordinates"}
@@ -303,7 +299,7 @@ def _stages(part: Part, learner: LearnerConfig) -> tuple[str, tuple[Stage, ...]]
     if part == "pp10":
         return "chain", compared(PP[:2], PP10_EPOCHS, learner)
     if part == "pp20":
-        return "chain", pp20(learner)
+        return "chain", compared(PP[:3], PP20_EPOCHS, learner)
     if part == "pp40":
         return "chain", compared(PP, PP40_EPOCHS, learner)
     if part == "pcp20":

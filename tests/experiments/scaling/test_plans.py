@@ -66,13 +66,6 @@ def test_no_stage_has_a_learner_of_its_own(study):
     assert {stage.learner for stage in study.stages} == {learner}
 
 
-def test_direct_transfer_has_the_steps_of_the_stage_it_leaves_out():
-    study, _ = studies("pp20", ["hetnet"])
-    direct = study.experiment([0]).by_name["direct"]
-    assert direct.start == "5x5"
-    assert steps([direct]) + plans.PP20_EPOCHS[0] == steps(chain(study))
-
-
 def test_teams_on_large_grids_are_reported_at_two_limits():
     assert [limits(task) for task in PP] == [(80,), (200,), (80, 200), (160, 400)]
 
@@ -84,7 +77,7 @@ def rival(name):
 def test_each_rival_changes_one_thing_of_the_chain():
     (own,) = studies("dilution", ["hetnet"])
     for name in RIVALS:
-        if name in ("mixed", "team-alone", "grid-alone"):
+        if name in ("direct", "mixed", "team-alone", "grid-alone"):
             continue
         for ours, theirs in zip(chain(own), chain(rival(name)), strict=True):
             assert (ours.name, ours.epochs, ours.learner) == (
@@ -103,6 +96,11 @@ def test_each_rival_changes_one_thing_of_the_chain():
 
 
 def test_rivals_that_change_the_tasks():
+    (own,) = studies("dilution", ["hetnet"])
+    first, _, last = chain(own)
+    source, target = chain(rival("direct"))
+    assert source == first
+    assert (target.env, target.start) == (last.env, source.name)
     (mixed,) = chain(rival("mixed"))
     assert (task_label(mixed.env), task_label(mixed.beside)) == ("20x20 10P", "10x10 5P")
     assert [task_label(s.env) for s in chain(rival("team-alone"))] == ["20x20 5P", "20x20 10P"]

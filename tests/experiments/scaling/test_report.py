@@ -117,6 +117,13 @@ def test_lines_of_the_figure_are_chain_and_scratch_from_one_first_stage(results)
     }
 
 
+def test_a_policy_that_was_tried_on_large_teams_alone_has_its_line(results):
+    for row in results.rows["stages"]:
+        row.update(part="dilution", policy="magic")
+    lines = cost_lines(arms(results))
+    assert list(lines["magic", "chain"]) == [20, 5]
+
+
 def test_scratch_that_is_kept_alone_is_no_chain(results):
     for rows in results.rows.values():
         rows[:] = [row for row in rows if row["stage"] == "scratch"]
