@@ -2,7 +2,8 @@
 
     python -m experiments.pretrained RUN... --commit COMMIT [--arms ARM...]
 
-Every stage of a run gives one entry: its best seed, as it comes back from the store. The best is
+Every stage of a run gives one entry: its best seed, as it comes back from the store. Runs that
+differ in nothing but their seeds, as where seeds were added later, are taken together. The best is
 the one that takes the fewest steps, sampled and greedy together, on 1,024 starts that are none of
 those of the card's figures, and with another key. The card's figures are measured anew.
 """
@@ -51,23 +52,27 @@ PRIVATE = ("--output", "--runs")
 
 
 def entries_of(
-    run: Path, commit: str, arms: Sequence[str] = (), folder: Path = store.FOLDER
+    runs: Sequence[Path], commit: str, arms: Sequence[str] = (), folder: Path = store.FOLDER
 ) -> list[str]:
-    """Adds a run's stages to the store, or renews them, and returns their names.
+    """Adds the stages of a plan to the store, or renews them, and returns their names.
+
+    Args:
+      runs: of that plan, each with seeds of its own.
 
     Raises:
       ValueError: for a run that is not finished, or an arm that it does not have.
     """
-    if not (run / "summary.json").exists():
-        raise ValueError(f"{run} is no finished run; its summary.json is not there.")
-    stages = stage_directories(run)
-    for arm in arms:
-        if arm not in stages:
-            raise ValueError(f"{run} has no arm {arm!r}; it has {', '.join(stages)}.")
-    config = json.loads((run / "config.json").read_text())
+    for run in runs:
+        if not (run / "summary.json").exists():
+            raise ValueError(f"{run} is no finished run; its summary.json is not there.")
+        known = stage_directories(run)
+        for arm in arms:
+            if arm not in known:
+                raise ValueError(f"{run} has no arm {arm!r}; it has {', '.join(known)}.")
     added = []
-    for arm in arms or stages:
-        agent, made = best_seed(stages[arm])
+    for arm in arms or stage_directories(runs[0]):
+        agent, run, made = best_seed(runs, arm)
+        config = json.loads((run / "config.json").read_text())
         steps = json.loads((run / "stages.json").read_text())[arm]["result"]["env_steps"]
         card = {
             **card_of(agent),
@@ -78,7 +83,7 @@ def entries_of(
             "trained_with": config["versions"],
             "measured_with": versions(),
             "licence": LICENCE,
-            "meta": meta_of(stages[arm], agent, made["seed"]),
+            "meta": meta_of(stage_directories(run)[arm], agent, made["seed"]),
         }
         name = name_of(agent.env, agent.policy.name)
         store.write(name, card, agent.params, folder)
@@ -86,22 +91,41 @@ def entries_of(
     return added
 
 
-def best_seed(directory: Path) -> tuple[Agent, dict[str, Any]]:
-    """The policy of a stage that does best, as the store keeps it, and what it was chosen among."""
-    seeds = checkpoint.read_meta(directory).get("seeds", [0])
-    agents = [as_kept(load_agent(directory, seed=seed)) for seed in seeds]
-    steps = [steps_elsewhere(agent) for agent in agents]
-    best = int(np.argmin(steps))
-    return agents[best], {
-        "seed": seeds[best],
-        "seeds_tried": seeds,
-        "chosen_by": {
-            "fewest": "steps taken, mean of sampled and greedy",
-            "starts": f"{EPISODES}, none of which is among those of the figures",
-            "key": CHOICE_SEED,
-            "by_seed": steps,
+def of_one_plan(runs: Sequence[Path]) -> list[list[Path]]:
+    """The runs in groups that differ in their seeds alone."""
+    groups: dict[str, list[Path]] = {}
+    for run in runs:
+        plan = json.loads((run / "config.json").read_text())["experiment"]
+        groups.setdefault(json.dumps({**plan, "seeds": None}, sort_keys=True), []).append(run)
+    return list(groups.values())
+
+
+def best_seed(runs: Sequence[Path], arm: str) -> tuple[Agent, Path, dict[str, Any]]:
+    """The policy of a stage that does best, as the store keeps it, its run, and what it was chosen
+    among.
+    """
+    tried = [
+        (seed, run, as_kept(load_agent(directory, seed=seed)))
+        for run in runs
+        for directory in [stage_directories(run)[arm]]
+        for seed in checkpoint.read_meta(directory).get("seeds", [0])
+    ]
+    steps = [steps_elsewhere(agent) for _, _, agent in tried]
+    seed, run, agent = tried[int(np.argmin(steps))]
+    return (
+        agent,
+        run,
+        {
+            "seed": seed,
+            "seeds_tried": [seed for seed, _, _ in tried],
+            "chosen_by": {
+                "fewest": "steps taken, mean of sampled and greedy",
+                "starts": f"{EPISODES}, none of which is among those of the figures",
+                "key": CHOICE_SEED,
+                "by_seed": steps,
+            },
         },
-    }
+    )
 
 
 def as_kept(agent: Agent) -> Agent:
@@ -228,8 +252,8 @@ def main() -> None:
     parser.add_argument("--commit", required=True, help="of the package that trained them")
     parser.add_argument("--arms", nargs="*", default=[], help="stages; all if not given")
     chosen = parser.parse_args()
-    for run in chosen.runs:
-        for name in entries_of(run, chosen.commit, chosen.arms):
+    for runs in of_one_plan(chosen.runs):
+        for name in entries_of(runs, chosen.commit, chosen.arms):
             print(name, json.dumps(store.card(name)["held_out"]))
     write_table()
     total = sum(file.stat().st_size for file in store.FOLDER.iterdir())

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import pretrained
-from experiments.pretrained import command_of, entries_of, name_of
+from experiments.pretrained import command_of, entries_of, name_of, of_one_plan
 from sumajax import PredatorPrey, StateUpsampled, checkpoint, make_policy, store
 from sumajax.environments import PredatorCapturePrey
 from sumajax.evaluation import EPISODES, held_out_keys, load_agent
@@ -16,16 +16,27 @@ from sumajax.learning import make_learner, parallel
 
 TASK = StateUpsampled(PredatorPrey(size=2, num_predators=1, max_steps=6), 4)
 SEEDS = (3, 8)
+LATER = 2
+"""A seed that was added; among the three it takes the fewest steps."""
 FEW = 16
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """The files of a finished run: two seeds, neither of them trained."""
-    directory = tmp_path_factory.mktemp("runs") / "run"
+    return finished(tmp_path_factory.mktemp("runs") / "run", SEEDS)
+
+
+@pytest.fixture(scope="module")
+def later(tmp_path_factory):
+    """Of a run of the same plan with a seed that was added."""
+    return finished(tmp_path_factory.mktemp("runs") / "later", (LATER,))
+
+
+def finished(directory, seeds):
     policy = make_policy("iric", TASK, hidden=4, encoder="linear")
-    meta = checkpoint.describe(TASK, policy, arm="source", seeds=list(SEEDS), epoch=1, stops=[])
-    state = {"params": parallel.init_seeds(make_learner(TASK, policy), list(SEEDS)).params}
+    meta = checkpoint.describe(TASK, policy, arm="source", seeds=list(seeds), epoch=1, stops=[])
+    state = {"params": parallel.init_seeds(make_learner(TASK, policy), list(seeds)).params}
     checkpoint.save(directory / "checkpoints" / "source", state, meta)
     command = [
         "/somewhere/sumajax",
@@ -34,10 +45,10 @@ def run(tmp_path_factory):
         "--output",
         "/somewhere/run",
         "--seeds",
-        "3",
-        "8",
+        *map(str, seeds),
     ]
-    config = {"command": command, "versions": {"python": "3.11"}}
+    plan = {"name": "pp_transfer", "seeds": list(seeds)}
+    config = {"command": command, "experiment": plan, "versions": {"python": "3.11"}}
     (directory / "config.json").write_text(json.dumps(config))
     (directory / "stages.json").write_text(json.dumps({"source": {"result": {"env_steps": 7}}}))
     (directory / "summary.json").write_text("{}")
@@ -47,12 +58,15 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def made(run, tmp_path_factory):
     """Name, card and parameters of its entry."""
-    folder = tmp_path_factory.mktemp("store")
+    return entry([run], tmp_path_factory.mktemp("store"))
+
+
+def entry(runs, folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pretrained, "EPISODES", FEW)
         patch.setattr(pretrained, "CHECK_EPISODES", FEW // 2)
         patch.setattr(store, "FOLDER", folder)
-        (name,) = entries_of(run, "abc1234", folder=folder)
+        (name,) = entries_of(runs, "abc1234", folder=folder)
         return name, store.card(name), load_agent(name).params
 
 
@@ -65,6 +79,26 @@ def test_it_is_the_seed_that_takes_fewest_steps_as_the_store_keeps_it(run, made)
     assert card["meta"]["seeds"] == [card["seed"]]
     kept = store.as_kept(load_agent(run, seed=card["seed"]).params)
     assert all(map(np.array_equal, jax.tree.leaves(kept), jax.tree.leaves(params)))
+
+
+def test_seeds_that_were_added_later_are_chosen_among_too(run, later, made, tmp_path):
+    _, card, params = entry([run, later], tmp_path)
+    _, before, _ = made
+    assert card["seeds_tried"] == [*SEEDS, LATER]
+    assert card["chosen_by"]["by_seed"][:2] == before["chosen_by"]["by_seed"]
+    assert card["seed"] == LATER
+    assert card["command"] == f"sumajax transfer pp --seeds {LATER}"
+    kept = store.as_kept(load_agent(later).params)
+    assert all(map(np.array_equal, jax.tree.leaves(kept), jax.tree.leaves(params)))
+
+
+def test_runs_are_taken_together_where_only_their_seeds_differ(run, later, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    config = json.loads((run / "config.json").read_text())
+    config["experiment"]["name"] = "another"
+    (other / "config.json").write_text(json.dumps(config))
+    assert of_one_plan([run, other, later]) == [[run, later], [other]]
 
 
 def test_the_card_says_how_it_came_about(made):
@@ -118,9 +152,9 @@ def test_a_command_says_no_places(given, kept):
 
 def test_a_run_that_is_not_finished_is_refused(run, tmp_path):
     with pytest.raises(ValueError, match="is no finished run"):
-        entries_of(tmp_path, "abc1234", folder=tmp_path)
+        entries_of([tmp_path], "abc1234", folder=tmp_path)
     with pytest.raises(ValueError, match="no arm 'target'; it has source"):
-        entries_of(run, "abc1234", ["target"], tmp_path)
+        entries_of([run], "abc1234", ["target"], tmp_path)
 
 
 def test_an_entry_is_renewed_not_doubled(tmp_path):
