@@ -96,8 +96,8 @@ class TransferOptions:
     """blocks: the paper's. corner: the small state as it is, zeros around it. none: the small state
     alone, which only the encoders lab_gap and coordinates can take to another grid."""
     encoder: EncoderKind = "flat"
-    """How the policy reads the state: flat, lab_gap (pools over the grid), linear or coordinates
-    (shares of the grid's sides)."""
+    """How the policy reads the state: flat, flat_published (started as the originals start their
+    layers), lab_gap (pools over the grid), linear or coordinates (shares of the grid's sides)."""
     carry_optimiser: bool = False
     """Carry the optimiser's memory over with the parameters."""
     leave_out: tuple[str, ...] = ()

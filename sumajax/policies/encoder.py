@@ -2,12 +2,15 @@
 
 The paper says only "convolutional and fully-connected layers" (section IV-C), the sizes are this
 package's: docs/reference/policies.md, Encoders. `flat` reads positions exactly because it flattens;
-`lab_gap` is the encoder of the authors' later public branch, which pools over the grid and so
-cannot tell most inner cells of a native grid apart; `linear` has no convolution; `coordinates`
-reads where the state is lit, as a share of the grid's sides, and so is of no grid's size.
+`flat_published` is the same, started as the originals start their layers, and so says next to
+nothing of a position at first; `lab_gap` is the encoder of the authors' later public branch, which
+pools over the grid and so cannot tell most inner cells of a native grid apart; `linear` has no
+convolution; `coordinates` reads where the state is lit, as a share of the grid's sides, and so is
+of no grid's size.
 """
 
 import math
+from functools import partial
 from typing import Any, Literal, get_args
 
 import chex
@@ -20,8 +23,9 @@ from sumajax.environments.states import SparseStates
 from sumajax.policies.layers import Dense, lift
 from sumajax.policies.lit_places import lit_places, sum_by_state
 
-EncoderKind = Literal["flat", "lab_gap", "linear", "coordinates"]
+EncoderKind = Literal["flat", "flat_published", "lab_gap", "linear", "coordinates"]
 ENCODERS = get_args(EncoderKind)
+FLAT: tuple[EncoderKind, ...] = ("flat", "flat_published")
 Resize = Literal["nearest", "bilinear"]
 
 STATE_FEATURES = 128
@@ -74,15 +78,20 @@ def patches(
 
 
 class Conv(nn.Module):
-    """A convolution over (..., rows, columns, c), initialised as in the originals."""
+    """A convolution over (..., rows, columns, c), to be followed by a ReLU.
+
+    Attributes:
+      published: initialised as in the originals, not as He et al. 2015.
+    """
 
     features: int
     kernel: int
     stride: int = 1
     padding: Literal["SAME", "VALID"] = "VALID"
+    published: bool = False
 
     def setup(self) -> None:
-        self.dense = Dense(self.features, before_relu=True)
+        self.dense = Dense(self.features, before_relu=not self.published)
 
     def __call__(self, x: chex.Array) -> chex.Array:
         return self.dense(self.patches(x))
@@ -94,28 +103,29 @@ class Conv(nn.Module):
 class StateEncoder(nn.Module):
     """(S, C, rows, columns) state tensors -> (S, 128).
 
-    Sparse states and NumPy arrays are known when the program is compiled: `flat` then computes only
+    Sparse states and NumPy arrays are known when the program is compiled: `FLAT` then computes only
     what differs from an empty grid (`lit_places`), the same to rounding.
     """
 
     kind: EncoderKind = "flat"
 
     def setup(self) -> None:
-        reached = None
-        if self.kind == "flat":
-            self.conv1 = Conv(8, kernel=3, padding="SAME")
-            self.conv2 = Conv(PLACE_CHANNELS, kernel=3, stride=PLACE_CELLS, padding="SAME")
-            reached = LIT_PATCHES * self.conv2.features
+        reached, published = None, self.kind == "flat_published"
+        if self.kind in FLAT:
+            conv = partial(Conv, kernel=3, padding="SAME", published=published)
+            self.conv1 = conv(8)
+            self.conv2 = conv(PLACE_CHANNELS, stride=PLACE_CELLS)
+            reached = None if published else LIT_PATCHES * self.conv2.features
         if self.kind == "lab_gap":
             self.conv1 = Conv(64, kernel=3)
             self.conv2 = Conv(STATE_FEATURES, kernel=2)
         else:
-            self.dense = Dense(STATE_FEATURES, fan_in=reached, before_relu=True)
+            self.dense = Dense(STATE_FEATURES, fan_in=reached, before_relu=not published)
 
     def __call__(self, states: chex.Array | SparseStates) -> chex.Array:
-        if self.kind == "flat" and isinstance(states, np.ndarray):
+        if self.kind in FLAT and isinstance(states, np.ndarray):
             states = SparseStates.of(states)
-        if self.kind == "flat" and isinstance(states, SparseStates):
+        if self.kind in FLAT and isinstance(states, SparseStates):
             return nn.relu(self._known(states))
         if self.kind == "coordinates":
             return nn.relu(self.dense(fourier_features(states)))
@@ -201,7 +211,7 @@ def table_grid(kind: EncoderKind, state_shape: tuple[int, int, int]) -> tuple[in
     channels, rows, columns = state_shape
     if kind == "linear":
         return rows, columns, channels
-    if kind == "flat":
+    if kind in FLAT:
         return -(-rows // PLACE_CELLS), -(-columns // PLACE_CELLS), PLACE_CHANNELS
     raise ValueError(f"encoder {kind!r} has no position table to resize; use 'flat' or 'linear'.")
 
@@ -231,14 +241,22 @@ def resized_table(
 
 
 class ViewEncoder(nn.Module):
-    """(..., c, m, m) views -> (..., 32): a convolution of at most 3x3, then a dense layer."""
+    """(..., c, m, m) views -> (..., 32): a convolution of at most 3x3, then a dense layer.
+
+    Attributes:
+      kind: of the state's encoder; `flat_published` starts this one as the originals do too.
+    """
+
+    kind: EncoderKind = "flat"
 
     @nn.compact
     def __call__(self, view: chex.Array) -> chex.Array:
         kernel = min(VIEW_KERNEL, view.shape[-1])
-        x = nn.relu(Conv(VIEW_FEATURES, kernel, name="conv")(jnp.moveaxis(view, -3, -1)))
+        published = self.kind == "flat_published"
+        conv = Conv(VIEW_FEATURES, kernel, published=published, name="conv")
+        x = nn.relu(conv(jnp.moveaxis(view, -3, -1)))
         x = x.reshape(*view.shape[:-3], x.shape[-3] * x.shape[-2] * x.shape[-1])
-        return nn.relu(Dense(VIEW_FEATURES, before_relu=True, name="dense")(x))
+        return nn.relu(Dense(VIEW_FEATURES, before_relu=not published, name="dense")(x))
 
 
 class ObservationEncoder(nn.Module):
@@ -254,7 +272,7 @@ class ObservationEncoder(nn.Module):
     def setup(self) -> None:
         fan_in = STATE_FEATURES + VIEW_FEATURES
         self.state_encoder = StateEncoder(self.kind)
-        self.view_encoder = ViewEncoder()
+        self.view_encoder = ViewEncoder(self.kind)
         self.merge_state = Dense(self.features, fan_in=fan_in)
         self.merge_view = Dense(self.features, use_bias=False, fan_in=fan_in)
 

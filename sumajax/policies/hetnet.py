@@ -426,7 +426,7 @@ class HetNet(PolicyModule):
 
     def setup(self) -> None:
         self.state_encoder = StateEncoder(self.encoder)
-        self.view_encoder = ViewEncoder()
+        self.view_encoder = ViewEncoder(self.encoder)
         self.core = HetNetCore(bits=self.bits, critic=self.critic)
 
     def encode_states(self, states: chex.Array | SparseStates) -> chex.Array:

@@ -42,12 +42,37 @@ def distinct_codes(kind, states):
 
 
 @pytest.mark.parametrize("size", [10, 20])
-def test_where_an_agent_is_shows_from_the_start_whatever_the_grid(size):
+@pytest.mark.parametrize(
+    ("kind", "least", "most"), [("flat", 0.1, 0.4), ("flat_published", 0.001, 0.005)]
+)
+def test_how_much_shows_from_the_start_of_where_an_agent_is_whatever_the_grid(
+    kind, least, most, size
+):
     """Measured 0.2 with native cells; 0.003 and 0.002 with the published layers' initialisation."""
     states = PredatorPrey(size=size).state_table()
-    spread = jax.jit(lambda key: StateEncoder().init_with_output(key, states)[0].std(0).mean())
+    spread = jax.jit(lambda key: StateEncoder(kind).init_with_output(key, states)[0].std(0).mean())
     spreads = [spread(jax.random.key(seed)) for seed in range(3)]
-    assert 0.1 < np.mean(spreads) < 0.4
+    assert least < np.mean(spreads) < most
+
+
+@pytest.mark.parametrize(
+    ("encoder", "example", "layer", "inputs"),
+    [
+        (StateEncoder("flat_published"), NATIVE, ("conv1", "dense"), 9),
+        (StateEncoder("flat_published"), NATIVE, ("conv2", "dense"), 72),
+        (StateEncoder("flat_published"), NATIVE, ("dense",), 400),
+        (ViewEncoder("flat_published"), np.zeros((1, 2, 3, 3)), ("conv", "dense"), 18),
+        (ViewEncoder("flat_published"), np.zeros((1, 2, 3, 3)), ("dense",), 32),
+    ],
+)
+def test_the_published_start_is_uniform_with_biases_as_large(encoder, example, layer, inputs):
+    """Within 1/sqrt(inputs), the default of the originals' layers."""
+    params = jax.jit(lambda key: encoder.init(key, example))(jax.random.key(0))["params"]
+    for name in layer:
+        params = params[name]
+    bound = inputs**-0.5
+    assert 0.9 * bound < np.abs(params["kernel"]).max() <= bound
+    assert 0.5 * bound < np.abs(params["bias"]).max() <= bound
 
 
 @pytest.mark.parametrize(
