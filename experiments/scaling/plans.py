@@ -25,7 +25,7 @@ PP20_EPOCHS = (40, 40, 60)  # 5x5, 10x10, 20x20
 PP40_EPOCHS = (40, 40, 60, 50)  # 5x5, 10x10, 20x20, 40x40
 PCP20_EPOCHS = (50, 50, 75)  # 5x5, 10x10, 20x20
 RECT_EPOCHS = (80, 80)  # 10x20, 20x40
-BRIEF_EPOCHS = (15, 15, 60)  # 5x5, 10x10, 20x20: sources cut short
+CUT_EPOCHS = {"brief": (15, 15, 60), "short": (25, 25, 60)}  # 5x5, 10x10, 20x20: shorter sources
 STILL_EPOCHS = (100, 100, 150)  # at most, where a stage ends by itself
 EVALUATE_EVERY = 5
 """Epochs between held-out evaluations while a stage trains."""
@@ -92,7 +92,9 @@ VARIANTS = {
     "magic": Variant("magic"),
 }
 
-Part = Literal["pp10", "pp20", "pp40", "pcp20", "rect", "rivals", "dilution", "brief", "still"]
+Part = Literal[
+    "pp10", "pp20", "pp40", "pcp20", "rect", "rivals", "dilution", "brief", "short", "still"
+]
 PARTS: tuple[Part, ...] = get_args(Part)
 OWN_POLICIES: dict[str, tuple[str, ...]] = {
     "pp10": ("hetnet", "ic3net"),
@@ -103,6 +105,7 @@ OWN_POLICIES: dict[str, tuple[str, ...]] = {
     "rivals": ("hetnet",),
     "dilution": tuple(VARIANTS),
     "brief": ("hetnet",),
+    "short": ("hetnet",),
     "still": ("hetnet",),
 }
 """What each part is run with where nothing is said."""
@@ -309,8 +312,8 @@ def _stages(part: Part, learner: LearnerConfig) -> tuple[str, tuple[Stage, ...]]
     envs = [seen_at(task, PP[2]) for task in PP[:3]]
     if part == "dilution":
         return "chain", chain_of(envs, PP20_EPOCHS, learner)
-    if part == "brief":
-        return "chain of brief sources", chain_of(envs, BRIEF_EPOCHS, learner)
+    if part in CUT_EPOCHS:
+        return f"chain of {part} sources", chain_of(envs, CUT_EPOCHS[part], learner)
     stages = chain_of(envs, STILL_EPOCHS, learner)
     return "chain that ends its stages itself", tuple(
         replace(stage, until=Still()) for stage in stages

@@ -40,8 +40,8 @@ class Options:
 
     parts: tuple[Part, ...] = ("pp20",)
     """pp10, pp20, pp40: Predator-Prey by way of 5x5. pcp20: Predator-Capture-Prey. rect: 10x20 to
-    20x40. rivals: what else makes a small task fit. dilution: policies on large teams. brief:
-    sources of 0.3 M steps each. still: stages that end themselves."""
+    20x40. rivals: what else makes a small task fit. dilution: policies on large teams. brief,
+    short: sources of 0.3 and of 0.5 M steps each. still: stages that end themselves."""
     policies: tuple[str, ...] = ()
     """hetnet, ic3net, ic3net-talking, ic3net-max, tarmac-ic3net, magic; each part's own if not
     given."""

@@ -21,7 +21,8 @@ TITLES = {
     "rect": "Predator-Prey, 20x40 with 14",
     "rivals": "Rivals of state upsampling, 20x20 with 10",
     "dilution": "Policies on large teams, 20x20 with 10",
-    "brief": "Brief sources, 20x20 with 10",
+    "brief": "Brief sources (0.3 M steps each), 20x20 with 10",
+    "short": "Short sources (0.5 M steps each), 20x20 with 10",
     "still": "Stages that end themselves, 20x20 with 10",
 }
 HOW = """\

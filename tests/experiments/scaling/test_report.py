@@ -151,7 +151,7 @@ def test_the_report_is_made_of_the_kept_files_alone(results):
     assert "92.0 (14.0-170.0; 1.000) at 200" in text
     assert "47.0 (14.0-80.0; 1.000) at 80" in text
     assert "0.06-0.06, > 0.06 (1 of 2)" in text
-    assert "Not run: pp10, pp40, pcp20, rect, rivals, dilution, brief, still." in text
+    assert "Not run: pp10, pp40, pcp20, rect, rivals, dilution, brief, short, still." in text
     files = {path.name for path in results.directory.iterdir()}
     assert {"cost.png", "curves-pp20.png", "matrix-pp20.png", "stages.csv"} <= files
 
