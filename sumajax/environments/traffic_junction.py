@@ -46,6 +46,12 @@ MAX_TABLE = 10_000_000
 """Numbers in a table of state tensors: beyond a hard junction of side 54 they are listed sparsely
 alone."""
 
+CRITIC_AHEAD, CRITIC_BEHIND = 8, 3
+"""Cells of its own way, before and behind a car, of which `critic_features` tells who is there. A
+collision further off is a matter of cars that have yet to brake or to come."""
+CRITIC_TIME = 10.0
+"""Unit of steps in `critic_features`."""
+
 MAX_STEPS = 2**31 - 1
 """Steps are counted in int32."""
 
@@ -220,6 +226,9 @@ class TrafficJunction:
 
     def measure(self, state: State, transition: Transition, following: State) -> chex.Array:
         return measure(self, state, transition, following)
+
+    def critic_features(self, state: State) -> chex.Array:
+        return critic_features(self, state)
 
     def rates(self, epochs: ArrayLike) -> np.ndarray:
         return rates(self, epochs)
@@ -397,6 +406,35 @@ def collided(env: TrafficJunction, state: State) -> chex.Array:
     return ((cell[:, None] == cell).sum(-1) > 1) & state.alive
 
 
+def critic_features(env: TrafficJunction, state: State) -> chex.Array:
+    """(N, F) float32: what each car's future depends on, the routes of the others included.
+
+    Of the cells of its own way from `CRITIC_BEHIND` behind it to `CRITIC_AHEAD` before it, as far
+    as the way goes: whether it is one, how many others are there, and how many will be one step
+    before it, at the same time and one step after it, if nobody brakes. Of itself: whether it has
+    just entered or braked, steps since it entered. Of the junction: share of slots that are empty,
+    arrival rate, steps left. Empty slots read zeros.
+    """
+    offsets = np.arange(-CRITIC_BEHIND, CRITIC_AHEAD + 1)
+    cells = _along(env, state, np.arange(-CRITIC_BEHIND - 1, CRITIC_AHEAD + 2))  # (N, K + 2)
+    own, now = cells[:, None, 1:-1], cells[None, :, CRITIC_BEHIND + 1, None]
+    # Who gets where: another is on its own k-th cell when this car is on its k-th, or a step apart.
+    at_times = [cells[None, :, 1 + lag : len(offsets) + 1 + lag] for lag in (-1, 0, 1)]
+    others = ~np.eye(env.num_cars, dtype=bool)[..., None] & (own >= 0)
+    counts = [((own == there) & others).sum(1) for there in (now, *at_times)]
+    shared = [
+        (~state.alive).mean(dtype=jnp.float32),
+        state.arrival_rate,
+        jnp.minimum((env.max_steps - state.time) / CRITIC_TIME, 1),
+    ]
+    itself = [state.wait == 0, state.last_action, state.wait / CRITIC_TIME]
+    columns = [*itself, *(jnp.broadcast_to(x, env.num_cars) for x in shared)]
+    columns = jnp.stack([x.astype(jnp.float32) for x in columns], axis=-1)
+    of_cells = [x.astype(jnp.float32) for x in (own[:, 0] >= 0, *counts)]
+    features = jnp.concatenate([*of_cells, columns], axis=-1)
+    return jnp.where(state.alive[:, None], features, 0)
+
+
 def measure(
     env: TrafficJunction, state: State, transition: Transition, following: State
 ) -> chex.Array:
@@ -484,6 +522,18 @@ def flat_observation(
         cells = jnp.concatenate([classes, cars[..., None]], axis=-1)
     flat = jnp.concatenate([*own, cells.reshape(env.num_cars, -1)], axis=-1)
     return jnp.where(state.alive[:, None], flat, 0).astype(jnp.float32)
+
+
+def _along(env: TrafficJunction, state: State, steps: np.ndarray) -> chex.Array:
+    """(N, K) int32 numbers of the cells so many `steps` (K,) on along each car's way; negative
+    where it does not go, and for empty slots.
+    """
+    numbers = grid.cell_index(env.roads.padded_routes, env.shape)
+    ways = np.pad(numbers, ((0, 0), (1, 1)), constant_values=grid.NOWHERE)
+    position = jnp.asarray(env.roads.position)[state.place][:, None] + steps
+    position = jnp.clip(position + 1, 0, ways.shape[1] - 1)  # the first and last are no cells
+    cells = jnp.asarray(ways)[jnp.asarray(env.roads.route)[state.place][:, None], position]
+    return jnp.where(state.alive[:, None], cells, grid.NOWHERE)
 
 
 def _move(env: TrafficJunction, state: State, actions: chex.Array) -> tuple[State, chex.Array]:
