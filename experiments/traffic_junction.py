@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -238,7 +238,8 @@ def run(options: Options) -> None:
       ValueError, OSError: one sentence each.
     """
     for study in [] if options.rebuild else [s for part in options.parts for s in studies(part)]:
-        for found in study_runs(study, options.seeds, options.runs, devices=1):
+        # Of a study nothing but its name and `experiment` is asked for.
+        for found in study_runs(cast(Any, study), options.seeds, options.runs, devices=1):
             note_session(found, options.output)
             if not found.has_ended:
                 run_experiment(found.experiment, found.directory, Where(devices=1))

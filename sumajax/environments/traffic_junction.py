@@ -428,10 +428,10 @@ def critic_features(env: TrafficJunction, state: State) -> chex.Array:
         jnp.minimum((env.max_steps - state.time) / CRITIC_TIME, 1),
     ]
     itself = [state.wait == 0, state.last_action, state.wait / CRITIC_TIME]
-    columns = [*itself, *(jnp.broadcast_to(x, env.num_cars) for x in shared)]
-    columns = jnp.stack([x.astype(jnp.float32) for x in columns], axis=-1)
+    figures = [*itself, *(jnp.broadcast_to(x, env.num_cars) for x in shared)]
     of_cells = [x.astype(jnp.float32) for x in (own[:, 0] >= 0, *counts)]
-    features = jnp.concatenate([*of_cells, columns], axis=-1)
+    rest = jnp.stack([x.astype(jnp.float32) for x in figures], axis=-1)
+    features = jnp.concatenate([*of_cells, rest], axis=-1)
     return jnp.where(state.alive[:, None], features, 0)
 
 
