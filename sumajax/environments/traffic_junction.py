@@ -74,6 +74,7 @@ class State:
     failed: chex.Array  # () bool: cars have collided in this episode
     time: chex.Array  # () int32 steps taken so far
     arrival_rate: chex.Array  # () float32: chance of a car per entry and step
+    hold_up: chex.Array  # () float32: chance that a car before a crossing is held up
     key: chex.PRNGKey  # () the arrivals still to be drawn
 
 
@@ -103,6 +104,9 @@ class TrafficJunction:
       final_arrival_rate: what the rate rises to in the course of training, and what the task is
         once that is over: an episode that is not of some epoch has it. None: it stays.
       rate_epochs: the first epoch in which it rises, and the first in which it no longer does.
+      hold_up: chance, in the first epochs of training, that a car that is about to enter a crossing
+        stays where it is, whatever it does. It falls to 0 until the end of `rate_epochs`, and is 0
+        in episodes that are not of some epoch.
       reset_last_action: a new car has not braked. In the original it has if the last car that
         stayed in its slot did.
 
@@ -118,6 +122,7 @@ class TrafficJunction:
     arrival_rate: float = None  # type: ignore[assignment]
     final_arrival_rate: float | None = None
     rate_epochs: tuple[int, int] = (250, 1250)
+    hold_up: float = 0.0
     reset_last_action: bool = False
 
     class_names: ClassVar[tuple[str, ...]] = ("cars",)
@@ -245,6 +250,13 @@ FIRST_RATES: dict[Difficulty, float] = {"easy": 0.1, "medium": 0.05, "hard": 0.0
 """Where the rates of IC3Net's commands begin; they rise to those above."""
 RISE = (1 / 8, 5 / 8)
 """The part of a training in which they rise: epochs 250 to 1250 of 2000."""
+HOLD_UP = 0.3
+"""In the first epochs. Drivers learn to keep their distance from who may stop, before anybody can
+gain by stopping; without that nobody whose follower is close ever gives way (docs/settings.md,
+Traffic Junction)."""
+
+HELD = 2**32 - 1
+"""Folded into an episode's key for who is held up; splitting it has no such number."""
 
 
 def reset(
@@ -265,6 +277,7 @@ def reset(
         failed=jnp.zeros((), bool),
         time=jnp.zeros((), jnp.int32),
         arrival_rate=jnp.asarray(rate, jnp.float32),
+        hold_up=jnp.float32(0),
         key=key,
     )
 
@@ -277,14 +290,20 @@ def reset_in_epoch(env: TrafficJunction, key: chex.PRNGKey, epoch: chex.Numeric)
 
     Source: the curriculum of IC3Net's published program.
     """
-    if not env.rises:
-        return reset(env, key)
-    table = rate_table(env)
-    return reset(env, key, jnp.asarray(table)[jnp.clip(epoch, 0, len(table) - 1)])
+    rate = None
+    if env.rises:
+        table = rate_table(env)
+        rate = jnp.asarray(table)[jnp.clip(epoch, 0, len(table) - 1)]
+    state = reset(env, key, rate)
+    if not env.hold_up:
+        return state
+    left = jnp.maximum(1 - jnp.float32(epoch) / max(env.rate_epochs[1], 1), 0)
+    return state.replace(hold_up=env.hold_up * left)  # type: ignore[attr-defined]
 
 
 def with_curriculum(env: TrafficJunction, epochs: int) -> TrafficJunction:
-    """`env` with a rate that rises over a training of so many epochs as IC3Net's do.
+    """`env` with a rate that rises over a training of so many epochs as IC3Net's do, and cars that
+    are held up the less the higher it is.
 
     A task whose rate rises already, or begins no higher than the published rate does, stays as it
     is.
@@ -297,6 +316,7 @@ def with_curriculum(env: TrafficJunction, epochs: int) -> TrafficJunction:
         arrival_rate=first,
         final_arrival_rate=env.arrival_rate,
         rate_epochs=(int(RISE[0] * epochs), int(RISE[1] * epochs)),
+        hold_up=HOLD_UP,
     )
 
 
@@ -316,7 +336,10 @@ def step(env: TrafficJunction, state: State, actions: chex.Array) -> tuple[State
     Raises:
       ValueError: for a concrete action out of range, a wrong shape or no whole numbers.
     """
-    moved, left = _move(env, state, checked_actions(env, actions))
+    actions = checked_actions(env, actions)
+    if env.hold_up:
+        actions = _hold_up(env, state, actions)
+    moved, left = _move(env, state, actions)
     key, draw_key = jax.random.split(state.key)
     arrivals = draw_arrivals(env, draw_key, moved.alive, moved.arrival_rate)
     return _arrive(env, moved.replace(key=key), left, arrivals)  # type: ignore[attr-defined]
@@ -524,6 +547,16 @@ def flat_observation(
     return jnp.where(state.alive[:, None], flat, 0).astype(jnp.float32)
 
 
+def _hold_up(env: TrafficJunction, state: State, actions: chex.Array) -> chex.Array:
+    """(N,) what the cars do where some of those before a crossing have to brake.
+
+    Arrivals are the same with and without, so evaluations are of the same episodes.
+    """
+    key = jax.random.fold_in(state.key, HELD)
+    held = jax.random.bernoulli(key, state.hold_up, actions.shape)
+    return jnp.where(held & jnp.asarray(env.roads.gives_way)[state.place], BRAKE, actions)
+
+
 def _along(env: TrafficJunction, state: State, steps: np.ndarray) -> chex.Array:
     """(N, K) int32 numbers of the cells so many `steps` (K,) on along each car's way; negative
     where it does not go, and for empty slots.
@@ -607,7 +640,7 @@ def _validate(env: TrafficJunction) -> None:
             f"size {env.size} of the {env.difficulty} junction must be even and at least "
             f"{4 + env.vision}, which is 4 and the vision."
         )
-    for name in ("arrival_rate", "final_arrival_rate"):
+    for name in ("arrival_rate", "final_arrival_rate", "hold_up"):
         rate = getattr(env, name)
         if name == "final_arrival_rate" and rate is None:
             continue
