@@ -10,7 +10,7 @@ the held-out episodes at the task's own rate, sampled and greedy.
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -80,8 +80,11 @@ class Study:
 def stage(
     name: str, difficulty: Difficulty, epochs: int, start: str | None = None, **seen: Any
 ) -> Stage:
-    """A task at rates that rise, seen at medium's size if `seen` says how."""
-    env: Environment = with_curriculum(TrafficJunction(difficulty), epochs)
+    """A task at rates that rise from an eighth to three eighths of its epochs, with hold-ups that
+    end two eighths later; seen at medium's size if `seen` says how.
+    """
+    task = with_curriculum(TrafficJunction(difficulty), epochs)
+    env: Environment = replace(task, rate_epochs=(epochs // 8, 3 * epochs // 8))
     if seen:
         env = StateUpsampled(env, TrafficJunction("medium").shape[0], **seen)
     return Stage(name, env, epochs, start, preset("fast", POLICY, **LEARNER))

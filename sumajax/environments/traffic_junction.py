@@ -104,9 +104,9 @@ class TrafficJunction:
       final_arrival_rate: what the rate rises to in the course of training, and what the task is
         once that is over: an episode that is not of some epoch has it. None: it stays.
       rate_epochs: the first epoch in which it rises, and the first in which it no longer does.
-      hold_up: chance, in the first epochs of training, that a car that is about to enter a crossing
-        stays where it is, whatever it does. It falls to 0 until the end of `rate_epochs`, and is 0
-        in episodes that are not of some epoch.
+      hold_up: chance, while it is learnt, that a car that is about to enter a crossing stays where
+        it is, whatever it does. After `rate_epochs` it falls to 0, in as many epochs as these are,
+        and it is 0 in episodes that are not of some epoch.
       reset_last_action: a new car has not braked. In the original it has if the last car that
         stayed in its slot did.
 
@@ -297,13 +297,14 @@ def reset_in_epoch(env: TrafficJunction, key: chex.PRNGKey, epoch: chex.Numeric)
     state = reset(env, key, rate)
     if not env.hold_up:
         return state
-    left = jnp.maximum(1 - jnp.float32(epoch) / max(env.rate_epochs[1], 1), 0)
+    first_epoch, end = env.rate_epochs
+    left = jnp.clip(1 - (jnp.float32(epoch) - end) / max(end - first_epoch, 1), 0, 1)
     return state.replace(hold_up=env.hold_up * left)  # type: ignore[attr-defined]
 
 
 def with_curriculum(env: TrafficJunction, epochs: int) -> TrafficJunction:
     """`env` with a rate that rises over a training of so many epochs as IC3Net's do, and cars that
-    are held up the less the higher it is.
+    are held up until some time after it.
 
     A task whose rate rises already, or begins no higher than the published rate does, stays as it
     is.

@@ -482,7 +482,7 @@ def test_reference_levels(difficulty, rate, episodes, gas, random):
 
 
 class TestHoldUps:
-    """Lessons in which cars before a crossing have to stay, the less the further training is."""
+    """Lessons in which cars before a crossing have to stay, until some time after the rise."""
 
     ENV = TrafficJunction(num_cars=3, hold_up=0.5, rate_epochs=(1, 10), arrival_rate=0.0)
 
@@ -494,9 +494,10 @@ class TestHoldUps:
             alive=jnp.array([True, True, False]),
         )
 
-    def test_it_falls_to_nothing_while_the_rate_rises(self):
-        chances = [float(self.before_the_crossing(epoch).hold_up) for epoch in (0, 5, 10, 20)]
-        np.testing.assert_allclose(chances, [0.5, 0.25, 0, 0])
+    def test_it_falls_to_nothing_once_the_rate_has_risen(self):
+        epochs = (0, 10, 13, 19, 30)
+        chances = [float(self.before_the_crossing(epoch).hold_up) for epoch in epochs]
+        np.testing.assert_allclose(chances, [0.5, 0.5, 0.5 * 6 / 9, 0, 0])
         assert float(self.ENV.reset(KEY).hold_up) == 0
 
     def test_only_who_is_about_to_enter_a_crossing_is_held_up(self):
