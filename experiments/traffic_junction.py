@@ -49,6 +49,8 @@ SOLVED = 0.8
 POLICY = "ic3net"
 SETTINGS: dict[str, Any] = {"talk_always": True}
 """As the published program has it in this domain."""
+HOLD_UP = 0.3
+"""Drivers learn to keep their distance from who may stop before anybody can gain by stopping."""
 LEARNER: dict[str, Any] = {"critic": "state", "entropy_weight": 0.01}
 """Settings of the learner other than those of preset `fast`; docs/settings.md, Traffic Junction."""
 
@@ -83,8 +85,9 @@ def stage(
     """A task at rates that rise from an eighth to three eighths of its epochs, with hold-ups that
     end two eighths later; seen at medium's size if `seen` says how.
     """
+    rise = (epochs // 8, 3 * epochs // 8)
     task = with_curriculum(TrafficJunction(difficulty), epochs)
-    env: Environment = replace(task, rate_epochs=(epochs // 8, 3 * epochs // 8))
+    env: Environment = replace(task, rate_epochs=rise, hold_up=HOLD_UP)
     if seen:
         env = StateUpsampled(env, TrafficJunction("medium").shape[0], **seen)
     return Stage(name, env, epochs, start, preset("fast", POLICY, **LEARNER))

@@ -285,8 +285,7 @@ class TJTransfer(TransferOptions):
     """Step limit of each stage; that of its difficulty if not given."""
     curriculum: bool = True
     """Let each stage's arrival rate rise as in IC3Net's runs, to that of the task, between an
-    eighth and five eighths of its epochs, and hold cars up before crossings the less the higher it
-    is. What is evaluated has the task's rate throughout, and nobody held up."""
+    eighth and five eighths of its epochs. What is evaluated has the task's rate throughout."""
     source_epochs: int = 60
     """Epochs of 20,000 environment steps on the source task."""
     threshold: float = 0.8
@@ -321,7 +320,7 @@ class TJTransfer(TransferOptions):
         return self.like(place).max_steps
 
     def taught(self, task: TrafficJunction, epochs: int) -> TrafficJunction:
-        """At rates that rise and with hold-ups that fall, with --curriculum."""
+        """At rates that rise, with --curriculum."""
         return with_curriculum(task, epochs) if self.curriculum else task
 
 

@@ -250,11 +250,6 @@ FIRST_RATES: dict[Difficulty, float] = {"easy": 0.1, "medium": 0.05, "hard": 0.0
 """Where the rates of IC3Net's commands begin; they rise to those above."""
 RISE = (1 / 8, 5 / 8)
 """The part of a training in which they rise: epochs 250 to 1250 of 2000."""
-HOLD_UP = 0.3
-"""In the first epochs. Drivers learn to keep their distance from who may stop, before anybody can
-gain by stopping; without that nobody whose follower is close ever gives way (docs/settings.md,
-Traffic Junction)."""
-
 HELD = 2**32 - 1
 """Folded into an episode's key for who is held up; splitting it has no such number."""
 
@@ -303,8 +298,7 @@ def reset_in_epoch(env: TrafficJunction, key: chex.PRNGKey, epoch: chex.Numeric)
 
 
 def with_curriculum(env: TrafficJunction, epochs: int) -> TrafficJunction:
-    """`env` with a rate that rises over a training of so many epochs as IC3Net's do, and cars that
-    are held up until some time after it.
+    """`env` with a rate that rises over a training of so many epochs as IC3Net's do.
 
     A task whose rate rises already, or begins no higher than the published rate does, stays as it
     is.
@@ -317,7 +311,6 @@ def with_curriculum(env: TrafficJunction, epochs: int) -> TrafficJunction:
         arrival_rate=first,
         final_arrival_rate=env.arrival_rate,
         rate_epochs=(int(RISE[0] * epochs), int(RISE[1] * epochs)),
-        hold_up=HOLD_UP,
     )
 
 

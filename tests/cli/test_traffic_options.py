@@ -6,7 +6,6 @@ from sumajax.cli import transfer
 from sumajax.cli.domains import DOMAINS, with_size
 from sumajax.cli.options import parse
 from sumajax.environments import TrafficJunction
-from sumajax.environments.traffic_junction import HOLD_UP
 from sumajax.learning import preset
 from sumajax.upsampling import StateUpsampled
 
@@ -77,12 +76,11 @@ def test_a_stage_has_the_settings_of_the_task_of_its_difficulty():
 
 
 def test_rates_rise_as_published_unless_they_are_not_to():
-    """0.1 to 0.3 and 0.05 to 0.2, from an eighth to five eighths of a stage, with hold-ups."""
+    """0.1 to 0.3 and 0.05 to 0.2, from an eighth to five eighths of a stage."""
     taught = stages("--source-epochs 80 --target-epochs 40", curriculum=True)
-    rising = {"final_arrival_rate": 0.3, "rate_epochs": (10, 50), "hold_up": HOLD_UP}
-    easy = TrafficJunction(arrival_rate=0.1, **rising)
-    rising = {"final_arrival_rate": 0.2, "rate_epochs": (5, 25), "hold_up": HOLD_UP}
-    medium = TrafficJunction("medium", arrival_rate=0.05, **rising)
+    easy = TrafficJunction(arrival_rate=0.1, final_arrival_rate=0.3, rate_epochs=(10, 50))
+    rising = {"arrival_rate": 0.05, "final_arrival_rate": 0.2, "rate_epochs": (5, 25)}
+    medium = TrafficJunction("medium", **rising)
     assert taught == {
         "source": StateUpsampled(easy, 14),
         "transfer": medium,

@@ -11,13 +11,11 @@ from sumajax.environments import Environment, TrafficJunction
 from sumajax.environments.traffic_junction import (
     BRAKE,
     GAS,
-    HOLD_UP,
     Arrivals,
     draw_arrivals,
     flat_observation,
     reset,
     step_with,
-    with_curriculum,
 )
 from sumajax.upsampling import StateUpsampled
 
@@ -525,6 +523,3 @@ class TestHoldUps:
             ends.append(state)
         for name in ("place", "alive", "wait"):
             np.testing.assert_array_equal(*(getattr(state, name) for state in ends))
-
-    def test_lessons_have_it(self):
-        assert with_curriculum(TrafficJunction(), 80).hold_up == HOLD_UP
