@@ -40,7 +40,7 @@ RESULTS = Path(__file__).parent / "results" / "traffic_junction"
 
 # --- What is run --------------------------------------------------------------------------------
 
-EPOCHS: dict[Difficulty, int] = {"easy": 70, "medium": 60, "hard": 25}
+EPOCHS: dict[Difficulty, int] = {"easy": 70, "medium": 45, "hard": 25}
 """Of 20,000 environment steps."""
 SOURCE_EPOCHS, TARGET_EPOCHS = 60, 30
 """Of part transfer; training from scratch beside it has the target's."""
