@@ -4,7 +4,7 @@
     policies/NAME.npz     the parameters
 
 All policies together are to stay below 4 MB, so that everybody who installs the package gets them.
-A matrix is therefore kept as whole numbers from -127 to 127 with a float32 scale for each of its
+A matrix is therefore kept as whole numbers from -63 to 63 with a float32 scale for each of its
 columns; everything smaller is float32. The card's figures are those of the parameters that come
 back, not of the ones that training ended with. `python -m experiments.pretrained RUN` makes entries
 of the stages of a finished run.
@@ -28,8 +28,9 @@ from sumajax.checkpoint.npz import packed, unpacked
 from sumajax.reporting.metrics import write_bytes, write_json
 
 FOLDER = Path(__file__).parent / "policies"
-LARGEST = 127
-"""Of the whole numbers that an entry of a matrix is kept as: int8, the same either side of 0."""
+LARGEST = 63
+"""Of the whole numbers that an entry of a matrix is kept as: seven bits, the same either side of 0,
+so that there is room for every kind of policy; what rounding costs: docs/pretrained.md."""
 SCALE = "/scale"
 """After a leaf's name: what a one stands for in each of its columns."""
 
