@@ -109,7 +109,7 @@ def _finish(found: StudyRun, options: Options, episodes: int) -> None:
     """Runs what is missing of an experiment and keeps it."""
     name = f"{found.study.name}, seeds {' '.join(map(str, found.seeds))}"
     print(f"== {name}", flush=True)
-    _note_session(found, options.output)
+    note_session(found, options.output)
     try:
         rows = found.finish(episodes)
     except StoppedError as error:  # no rows then; the others go on
@@ -122,7 +122,7 @@ def _finish(found: StudyRun, options: Options, episodes: int) -> None:
         replay = found.directory / "replay.gif"
         if found.study.part in REPLAYED and 0 in found.seeds and replay.exists():
             shutil.copy(replay, options.output / f"replay-{found.study.name}.gif")
-    _keep_plan(found, options.output)
+    keep_plan(found, options.output)
 
 
 @contextmanager
@@ -140,7 +140,7 @@ def _provenance(found: StudyRun, output: Path) -> Path:
     return output / PROVENANCE / f"{found.study.name}-{found.directory.name}.json"
 
 
-def _note_session(found: StudyRun, output: Path) -> None:
+def note_session(found: StudyRun, output: Path) -> None:
     """Adds a session to the run's file, unless the run has ended: command, commit, machine."""
     file = _provenance(found, output)
     if found.has_ended and file.exists():
@@ -159,7 +159,7 @@ def _note_session(found: StudyRun, output: Path) -> None:
     write_json(file, {**before, **about, "sessions": [*before.get("sessions", []), now]})
 
 
-def _keep_plan(found: StudyRun, output: Path) -> None:
+def keep_plan(found: StudyRun, output: Path) -> None:
     """Adds what was trained, resolved: tasks, starts and every setting of the learner."""
     file = _provenance(found, output)
     plan: Any = json.loads((found.directory / "config.json").read_text())["experiment"]

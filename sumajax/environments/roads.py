@@ -108,6 +108,12 @@ class Roads:
         return (self.cell == NOWHERE).all(-1)
 
     @cached_property
+    def gives_way(self) -> np.ndarray:
+        """(P,) bool: the next cell of the route is the first of a crossing."""
+        crosses = np.array([self.layout.is_crossing((int(r), int(c))) for r, c in self.cell])
+        return ~crosses & np.append(crosses[1:], False) & ~self.ended
+
+    @cached_property
     def first_places(self) -> np.ndarray:
         """(G, routes per entry) int32: where each route begins."""
         return np.flatnonzero(self.position == 0).astype(np.int32).reshape(len(self.entries), -1)

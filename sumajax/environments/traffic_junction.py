@@ -46,6 +46,12 @@ MAX_TABLE = 10_000_000
 """Numbers in a table of state tensors: beyond a hard junction of side 54 they are listed sparsely
 alone."""
 
+CRITIC_AHEAD, CRITIC_BEHIND = 8, 3
+"""Cells of its own way, before and behind a car, of which `critic_features` tells who is there. A
+collision further off is a matter of cars that have yet to brake or to come."""
+CRITIC_TIME = 10.0
+"""Unit of steps in `critic_features`."""
+
 MAX_STEPS = 2**31 - 1
 """Steps are counted in int32."""
 
@@ -68,6 +74,7 @@ class State:
     failed: chex.Array  # () bool: cars have collided in this episode
     time: chex.Array  # () int32 steps taken so far
     arrival_rate: chex.Array  # () float32: chance of a car per entry and step
+    hold_up: chex.Array  # () float32: chance that a car before a crossing is held up
     key: chex.PRNGKey  # () the arrivals still to be drawn
 
 
@@ -97,6 +104,9 @@ class TrafficJunction:
       final_arrival_rate: what the rate rises to in the course of training, and what the task is
         once that is over: an episode that is not of some epoch has it. None: it stays.
       rate_epochs: the first epoch in which it rises, and the first in which it no longer does.
+      hold_up: chance, while it is learnt, that a car that is about to enter a crossing stays where
+        it is, whatever it does. After `rate_epochs` it falls to 0, in as many epochs as these are,
+        and it is 0 in episodes that are not of some epoch.
       reset_last_action: a new car has not braked. In the original it has if the last car that
         stayed in its slot did.
 
@@ -112,6 +122,7 @@ class TrafficJunction:
     arrival_rate: float = None  # type: ignore[assignment]
     final_arrival_rate: float | None = None
     rate_epochs: tuple[int, int] = (250, 1250)
+    hold_up: float = 0.0
     reset_last_action: bool = False
 
     class_names: ClassVar[tuple[str, ...]] = ("cars",)
@@ -221,6 +232,9 @@ class TrafficJunction:
     def measure(self, state: State, transition: Transition, following: State) -> chex.Array:
         return measure(self, state, transition, following)
 
+    def critic_features(self, state: State) -> chex.Array:
+        return critic_features(self, state)
+
     def rates(self, epochs: ArrayLike) -> np.ndarray:
         return rates(self, epochs)
 
@@ -236,6 +250,8 @@ FIRST_RATES: dict[Difficulty, float] = {"easy": 0.1, "medium": 0.05, "hard": 0.0
 """Where the rates of IC3Net's commands begin; they rise to those above."""
 RISE = (1 / 8, 5 / 8)
 """The part of a training in which they rise: epochs 250 to 1250 of 2000."""
+HELD = 2**32 - 1
+"""Folded into an episode's key for who is held up; splitting it has no such number."""
 
 
 def reset(
@@ -256,6 +272,7 @@ def reset(
         failed=jnp.zeros((), bool),
         time=jnp.zeros((), jnp.int32),
         arrival_rate=jnp.asarray(rate, jnp.float32),
+        hold_up=jnp.float32(0),
         key=key,
     )
 
@@ -268,10 +285,16 @@ def reset_in_epoch(env: TrafficJunction, key: chex.PRNGKey, epoch: chex.Numeric)
 
     Source: the curriculum of IC3Net's published program.
     """
-    if not env.rises:
-        return reset(env, key)
-    table = rate_table(env)
-    return reset(env, key, jnp.asarray(table)[jnp.clip(epoch, 0, len(table) - 1)])
+    rate = None
+    if env.rises:
+        table = rate_table(env)
+        rate = jnp.asarray(table)[jnp.clip(epoch, 0, len(table) - 1)]
+    state = reset(env, key, rate)
+    if not env.hold_up:
+        return state
+    first_epoch, end = env.rate_epochs
+    left = jnp.clip(1 - (jnp.float32(epoch) - end) / max(end - first_epoch, 1), 0, 1)
+    return state.replace(hold_up=env.hold_up * left)  # type: ignore[attr-defined]
 
 
 def with_curriculum(env: TrafficJunction, epochs: int) -> TrafficJunction:
@@ -307,7 +330,10 @@ def step(env: TrafficJunction, state: State, actions: chex.Array) -> tuple[State
     Raises:
       ValueError: for a concrete action out of range, a wrong shape or no whole numbers.
     """
-    moved, left = _move(env, state, checked_actions(env, actions))
+    actions = checked_actions(env, actions)
+    if env.hold_up:
+        actions = _hold_up(env, state, actions)
+    moved, left = _move(env, state, actions)
     key, draw_key = jax.random.split(state.key)
     arrivals = draw_arrivals(env, draw_key, moved.alive, moved.arrival_rate)
     return _arrive(env, moved.replace(key=key), left, arrivals)  # type: ignore[attr-defined]
@@ -395,6 +421,35 @@ def collided(env: TrafficJunction, state: State) -> chex.Array:
     """(N,) bool: cars that share their cell."""
     cell = grid.cell_index(jnp.asarray(env.roads.cell)[state.place], env.shape)
     return ((cell[:, None] == cell).sum(-1) > 1) & state.alive
+
+
+def critic_features(env: TrafficJunction, state: State) -> chex.Array:
+    """(N, F) float32: what each car's future depends on, the routes of the others included.
+
+    Of the cells of its own way from `CRITIC_BEHIND` behind it to `CRITIC_AHEAD` before it, as far
+    as the way goes: whether it is one, how many others are there, and how many will be one step
+    before it, at the same time and one step after it, if nobody brakes. Of itself: whether it has
+    just entered or braked, steps since it entered. Of the junction: share of slots that are empty,
+    arrival rate, steps left. Empty slots read zeros.
+    """
+    offsets = np.arange(-CRITIC_BEHIND, CRITIC_AHEAD + 1)
+    cells = _along(env, state, np.arange(-CRITIC_BEHIND - 1, CRITIC_AHEAD + 2))  # (N, K + 2)
+    own, now = cells[:, None, 1:-1], cells[None, :, CRITIC_BEHIND + 1, None]
+    # Who gets where: another is on its own k-th cell when this car is on its k-th, or a step apart.
+    at_times = [cells[None, :, 1 + lag : len(offsets) + 1 + lag] for lag in (-1, 0, 1)]
+    others = ~np.eye(env.num_cars, dtype=bool)[..., None] & (own >= 0)
+    counts = [((own == there) & others).sum(1) for there in (now, *at_times)]
+    shared = [
+        (~state.alive).mean(dtype=jnp.float32),
+        state.arrival_rate,
+        jnp.minimum((env.max_steps - state.time) / CRITIC_TIME, 1),
+    ]
+    itself = [state.wait == 0, state.last_action, state.wait / CRITIC_TIME]
+    figures = [*itself, *(jnp.broadcast_to(x, env.num_cars) for x in shared)]
+    of_cells = [x.astype(jnp.float32) for x in (own[:, 0] >= 0, *counts)]
+    rest = jnp.stack([x.astype(jnp.float32) for x in figures], axis=-1)
+    features = jnp.concatenate([*of_cells, rest], axis=-1)
+    return jnp.where(state.alive[:, None], features, 0)
 
 
 def measure(
@@ -486,6 +541,28 @@ def flat_observation(
     return jnp.where(state.alive[:, None], flat, 0).astype(jnp.float32)
 
 
+def _hold_up(env: TrafficJunction, state: State, actions: chex.Array) -> chex.Array:
+    """(N,) what the cars do where some of those before a crossing have to brake.
+
+    Arrivals are the same with and without, so evaluations are of the same episodes.
+    """
+    key = jax.random.fold_in(state.key, HELD)
+    held = jax.random.bernoulli(key, state.hold_up, actions.shape)
+    return jnp.where(held & jnp.asarray(env.roads.gives_way)[state.place], BRAKE, actions)
+
+
+def _along(env: TrafficJunction, state: State, steps: np.ndarray) -> chex.Array:
+    """(N, K) int32 numbers of the cells so many `steps` (K,) on along each car's way; negative
+    where it does not go, and for empty slots.
+    """
+    numbers = grid.cell_index(env.roads.padded_routes, env.shape)
+    ways = np.pad(numbers, ((0, 0), (1, 1)), constant_values=grid.NOWHERE)
+    position = jnp.asarray(env.roads.position)[state.place][:, None] + steps
+    position = jnp.clip(position + 1, 0, ways.shape[1] - 1)  # the first and last are no cells
+    cells = jnp.asarray(ways)[jnp.asarray(env.roads.route)[state.place][:, None], position]
+    return jnp.where(state.alive[:, None], cells, grid.NOWHERE)
+
+
 def _move(env: TrafficJunction, state: State, actions: chex.Array) -> tuple[State, chex.Array]:
     """Every car goes on or stays; and (N,) bool: the cars that left the junction."""
     goes = state.alive & (actions == GAS)
@@ -557,7 +634,7 @@ def _validate(env: TrafficJunction) -> None:
             f"size {env.size} of the {env.difficulty} junction must be even and at least "
             f"{4 + env.vision}, which is 4 and the vision."
         )
-    for name in ("arrival_rate", "final_arrival_rate"):
+    for name in ("arrival_rate", "final_arrival_rate", "hold_up"):
         rate = getattr(env, name)
         if name == "final_arrival_rate" and rate is None:
             continue

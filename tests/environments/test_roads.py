@@ -99,3 +99,14 @@ def test_lines_tell_roads_in_a_window(vision):
         expected = around[row : row + side, column : column + side]
         np.testing.assert_array_equal(rows[:, None] * columns > 1, expected)
     assert not where.lines(vision)[where.ended].any()
+
+
+@each_grid
+def test_a_car_gives_way_before_each_crossing_of_its_route(difficulty, size):
+    where = roads(difficulty, size)
+    for route, cells in enumerate(where.routes):
+        on = [where.layout.is_crossing((int(row), int(column))) for row, column in cells]
+        before = [not here and ahead for here, ahead in pairwise(on)]
+        found = where.gives_way[where.route == route]
+        assert found.tolist() == [*before, False, False]  # the last cell, and the end
+    assert not where.gives_way[where.nowhere]

@@ -477,3 +477,49 @@ def test_reference_levels(difficulty, rate, episodes, gas, random):
         spread = max(math.sqrt(success * (1 - success)), math.sqrt(1 / episodes))
         assert abs(done.mean() - success) < 4 * both * spread + 0.0005
         assert abs(returns.mean() - returned) < 4 * both * returns.std() + 0.005
+
+
+class TestHoldUps:
+    """Lessons in which cars before a crossing have to stay, until some time after the rise."""
+
+    ENV = TrafficJunction(num_cars=3, hold_up=0.5, rate_epochs=(1, 10), arrival_rate=0.0)
+
+    def before_the_crossing(self, epoch):
+        """Down two cells in, right one."""
+        down, right = self.ENV.roads.first_places[:, 0]
+        return self.ENV.reset_in_epoch(KEY, jnp.int32(epoch)).replace(
+            place=jnp.array([down + 2, right + 1, self.ENV.roads.nowhere]),
+            alive=jnp.array([True, True, False]),
+        )
+
+    def test_it_falls_to_nothing_once_the_rate_has_risen(self):
+        epochs = (0, 10, 13, 19, 30)
+        chances = [float(self.before_the_crossing(epoch).hold_up) for epoch in epochs]
+        np.testing.assert_allclose(chances, [0.5, 0.5, 0.5 * 6 / 9, 0, 0])
+        assert float(self.ENV.reset(KEY).hold_up) == 0
+
+    def test_only_who_is_about_to_enter_a_crossing_is_held_up(self):
+        env, first = self.ENV, self.before_the_crossing(0)
+        held = first.replace(hold_up=jnp.float32(1))
+        after, _ = step(env, held, jnp.zeros(3, jnp.int32))
+        moved = np.asarray(after.place - first.place)[:2]
+        assert moved.tolist() == [0, 1]
+        assert after.last_action[:2].tolist() == [BRAKE, GAS]
+
+    def test_as_often_as_it_says(self):
+        first = self.before_the_crossing(0)
+        keys = jax.random.split(KEY, EPISODES)
+        states = jax.vmap(lambda key: first.replace(key=key))(keys)
+        after, _ = jax.vmap(lambda state: step(self.ENV, state, jnp.zeros(3, jnp.int32)))(states)
+        share = float((after.place[:, 0] == first.place[0]).mean())
+        assert abs(share - 0.5) < 4 * math.sqrt(0.25 / EPISODES)
+
+    def test_arrivals_are_those_of_the_task_without(self):
+        ends = []
+        for env in (TrafficJunction(num_cars=3), TrafficJunction(num_cars=3, hold_up=0.5)):
+            state = start(env, KEY)
+            for _ in range(4):
+                state, _ = step(env, state, jnp.zeros(3, jnp.int32))
+            ends.append(state)
+        for name in ("place", "alive", "wait"):
+            np.testing.assert_array_equal(*(getattr(state, name) for state in ends))

@@ -11,7 +11,8 @@ from beginnings import begun
 from probes import LastStepReward, Probe, ProbeState
 from trajectories import TINY_TASK, tiny_learner
 
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
+from sumajax.environments.traffic_junction import CRITIC_AHEAD, CRITIC_BEHIND
 from sumajax.learning import make_learner, preset
 from sumajax.learning.critic import init_critic, shown, values
 from sumajax.learning.rollout import start
@@ -163,6 +164,72 @@ class TestFeaturesOfPredatorCapturePrey:
         features = env.critic_features(state)
         assert features[:, sees].tolist() == [0, 1]
         assert features[:, anybody].tolist() == [1, 1]
+
+
+class TestFeaturesOfTrafficJunction:
+    """Two cars on easy: one two cells before the crossing, one three; and an empty slot."""
+
+    ENV = TrafficJunction("easy", num_cars=3, max_steps=8)
+    CELLS = CRITIC_BEHIND + 1 + CRITIC_AHEAD
+    CROSSING = 3
+
+    def features(self):
+        """(N, 5, cells): on its way; others there now, before it, with it, after it; (N, 6)."""
+        env = self.ENV
+        down, right = env.roads.first_places[:, 0]
+        state = env.reset(jax.random.key(0)).replace(
+            place=jnp.array([down + 1, right, env.roads.nowhere]),
+            alive=jnp.array([True, True, False]),
+            wait=jnp.array([2, 0, 0]),
+            last_action=jnp.array([1, 0, 1]),
+            time=jnp.int32(5),
+        )
+        features = np.asarray(env.critic_features(state))
+        split = 5 * self.CELLS
+        return features[:, :split].reshape(3, 5, self.CELLS), features[:, split:]
+
+    def test_cells_of_the_own_way(self):
+        way, length = self.features()[0][:, 0], 7
+        for car, position in enumerate([1, 0]):
+            on_it = position + np.arange(-CRITIC_BEHIND, CRITIC_AHEAD + 1)
+            np.testing.assert_array_equal(way[car], (on_it >= 0) & (on_it < length))
+
+    def test_who_gets_to_the_crossing_before_and_after(self):
+        cells, _ = self.features()
+        _, now, before, together, after = np.moveaxis(cells, 0, 1)
+        assert not now.any()
+        assert not together.any()
+        expected = np.zeros((3, self.CELLS))
+        expected[1, CRITIC_BEHIND + self.CROSSING] = 1
+        np.testing.assert_array_equal(before, expected)
+        expected = np.zeros((3, self.CELLS))
+        expected[0, CRITIC_BEHIND + self.CROSSING - 1] = 1
+        np.testing.assert_array_equal(after, expected)
+
+    def test_of_itself_and_of_the_junction(self):
+        _, rest = self.features()
+        shared = [1 / 3, 0.3, 0.3]
+        expected = [[0, 1, 0.2, *shared], [1, 0, 0, *shared], [0] * 6]
+        np.testing.assert_allclose(rest, expected, rtol=1e-6)
+
+    def test_who_is_behind(self):
+        env = self.ENV
+        down = env.roads.first_places[0, 0]
+        state = env.reset(jax.random.key(0)).replace(
+            place=jnp.array([down + 2, down + 1, env.roads.nowhere]),
+            alive=jnp.array([True, True, False]),
+        )
+        cells = np.asarray(env.critic_features(state))[:, : 5 * self.CELLS].reshape(3, 5, -1)
+        now = cells[:, 1]
+        assert now[0].nonzero()[0].tolist() == [CRITIC_BEHIND - 1]
+        assert now[1].nonzero()[0].tolist() == [CRITIC_BEHIND + 1]
+
+    def test_as_many_on_every_junction(self):
+        sizes = {
+            jax.eval_shape(env.critic_features, jax.eval_shape(env.reset, jax.random.key(0))).shape
+            for env in (TrafficJunction("medium", num_cars=3), TrafficJunction("hard", num_cars=3))
+        }
+        assert sizes == {(3, 5 * self.CELLS + 6)}
 
 
 class TestErrors:
