@@ -17,10 +17,10 @@ from sumajax.learning.config import EPOCH_STEPS, LearnerConfig
 
 REFERENCE_DECISIONS = 100.0
 """Of 5 agents on 10x10, the task on which `fast` was found."""
-OWN_CRITIC_SHARE = 1 / 8
+OWN_CRITIC_SHARE = 3 / 16
 """Of the reference: the size up to which a policy's own critic keeps what a transfer brought. Tried
 on both sides: with 1/4 (10 agents on 20x20) it learns as fast as one that is shown the state, with
-1/16 (20 on 40x40) its policy is lost."""
+1/8 (14 on 20x40) and 1/16 (20 on 40x40) its policy is lost."""
 CRITIC_LIMITS = 5
 """Step limits that the critic learns alone for: it has to see whole episodes, and more than one."""
 
