@@ -70,6 +70,11 @@ class TestAfterTransfer:
         assert config.critic == "state"
         assert config.gamma == pytest.approx(0.9875)
 
+    def test_on_20x40_with_14_the_critic_is_shown_the_state_too(self):
+        env = PredatorPrey(size=(20, 40), num_predators=14, max_steps=400)
+        assert share_of_reference(env) == pytest.approx(0.126, abs=5e-4)
+        assert after_transfer(preset("fast"), env).critic == "state"
+
     def test_up_to_20x20_the_critic_is_the_policys_own(self):
         config = after_transfer(preset("fast"), TWENTY)
         assert config.critic == "policy"

@@ -17,7 +17,11 @@ import pytest
 from .rows import RESULTS
 
 ROOT = RESULTS.parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    RESULTS / "scale" / "README.md",
+]
 MARK = re.compile(r"<!-- recomputed: ([^>]*?) -->\n\|.*\n\|[-|]*\n((?:\|.*\n)+)")
 
 EXPERIMENTS = ("pp-ic3net", "pp-magic", "pp-hetnet", "pcp-hetnet-2p1c", "pcp-hetnet-3p2c")
@@ -245,8 +249,12 @@ def evaluated_cells(name, arm):
     return [f"{steps:.1f} M" if steps else "0", *cells]
 
 
-SCRATCH_OF = {"pp40-hetnet": "pp20-hetnet-scratch", "pcp20-hetnet": "pcp20-hetnet-scratch"}
-"""By chain: what has its steps up to the end of its 20x20 stage, on 20x20 alone."""
+CHAINS = {
+    ("10x10", None): "pp10-hetnet",
+    ("20x20", None): "pp20-hetnet",
+    ("40x40", None): "pp40-hetnet",
+    ("20x20", " and 4 capturers"): "pcp20-hetnet",
+}
 
 
 def larger_grid(title):
@@ -254,29 +262,87 @@ def larger_grid(title):
     grid, capturers, limit = re.match(
         r"(\d+x\d+), \d+ predators( and \d+ capturers)?, limit (\d+)", title
     ).groups()
-    chain = "pcp20-hetnet" if capturers else "pp40-hetnet"
+    chain = CHAINS[grid, capturers]
+    scratch = f"{chain}-scratch"
     stage = kept("stages", experiment=chain, stage=grid)
     ((task, trained, bound),) = {(r["task"], r["env_steps"], r["bound"]) for r in stage}
+    seeds = [len(stage), len(kept("stages", experiment=scratch))]
 
     def mean(experiment, name, when, mode):
-        rows = kept("held_out", experiment=experiment, stage=name, task=task, limit=limit)
-        assert {row["episodes"] for row in rows} <= {"1024"}
-        rows = [row for row in rows if (row["when"], row["mode"]) == (when, mode)]
-        steps = [float(row["steps_taken"]) for row in rows]
-        if not steps:
-            return "-"
-        success = np.mean([float(row["success"]) for row in rows])
-        between = f"{min(steps):.1f}-{max(steps):.1f}"
-        return f"{np.mean(steps):.1f} ({between}; {success:.3f})"
+        return played(experiment, name, task, limit, when, mode)
 
     return [
+        ", ".join(map(str, filter(None, seeds))),
         f"{int(trained) / 1e6:.1f} M",
         mean(chain, grid, "zero shot", "sampled"),
         mean(chain, grid, "end", "sampled"),
         mean(chain, grid, "end", "greedy"),
-        mean(SCRATCH_OF[chain], "scratch", "end", "sampled"),
+        mean(scratch, "scratch", "end", "sampled"),
         f"{float(bound):.1f}",
     ]
+
+
+def played(experiment, stage, task, limit, when, mode):
+    """Mean steps taken over seeds (least and greatest seed; success)."""
+    rows = kept("held_out", experiment=experiment, stage=stage, task=task, limit=limit)
+    assert {row["episodes"] for row in rows} <= {"1024"}
+    rows = [row for row in rows if (row["when"], row["mode"]) == (when, mode)]
+    steps = [float(row["steps_taken"]) for row in rows]
+    if not steps:
+        return "-"
+    success = np.mean([float(row["success"]) for row in rows])
+    between = f"{min(steps):.1f}-{max(steps):.1f}; " if len(steps) > 1 else ""
+    return f"{np.mean(steps):.1f} ({between}{success:.3f})"
+
+
+def on_20x20(title):
+    """Of the experiment named: what ends on 20x20 with 10, and its cost to 2 x shortest paths."""
+    experiment = re.search(r"`([\w-]+)`", title)[1]
+    task, limit = "20x20 10P", "200"
+    rows = kept("stages", experiment=experiment, task=task)
+    (stage,) = {row["stage"] for row in rows}
+    costs = [cost_to_twice(row, limit) for row in rows]
+    return [
+        str(len(rows)),
+        played(experiment, stage, task, limit, "zero shot", "sampled"),
+        played(experiment, stage, task, "80", "end", "sampled"),
+        played(experiment, stage, task, limit, "end", "sampled"),
+        first_there([steps / 1e6 for steps, _ in costs], ".2f"),
+        first_there([seconds for _, seconds in costs], ".0f"),
+    ]
+
+
+def cost_to_twice(row, limit):
+    """(environment steps, CPU seconds), the sources counted, of the first held-out figure there."""
+    place = {name: row[name] for name in ("experiment", "stage", "seed")}
+    before = [
+        stage
+        for stage in kept("stages", experiment=row["experiment"], seed=row["seed"])
+        if stage["stage"] in row["after"].split()
+    ]
+    own = kept("held_out", **place, task=row["task"], limit=limit, mode="sampled")
+    whens = {point["when"]: point["steps_taken"] for point in own}
+    way = [
+        (p["env_steps"], p["cpu_seconds"], p["steps_taken"]) for p in kept("evaluations", **place)
+    ]
+    if "zero shot" in whens:
+        way.insert(0, (0, 0, whens["zero shot"]))
+    way.append((row["env_steps"], row["cpu_seconds"], whens["end"]))
+    for steps, seconds, taken in way:
+        if float(taken) <= 2 * float(row["bound"]):
+            sources = [(int(s["env_steps"]), float(s["cpu_seconds"])) for s in before]
+            return tuple(np.sum([(int(steps), float(seconds)), *sources], axis=0))
+    return math.inf, math.inf
+
+
+def first_there(costs, form):
+    """Mean (least-greatest), or how many were there."""
+    if math.inf in costs:
+        arrived = sum(map(math.isfinite, costs))
+        return "never" if not arrived else f"{arrived} of {len(costs)}"
+    if len(costs) == 1:
+        return f"{costs[0]:{form}}"
+    return f"{np.mean(costs):{form}} ({min(costs):{form}}-{max(costs):{form}})"
 
 
 def kept(file, **cells):
@@ -294,6 +360,9 @@ TABLES = {
     "evaluations pp-hetnet": evaluated("pp-hetnet"),
     "evaluations pcp": capture,
     "larger grids": larger_grid,
+    "to 20x20": on_20x20,
+    "rivals": on_20x20,
+    "large teams": on_20x20,
 }
 
 
@@ -333,6 +402,9 @@ def test_every_table_is_found():
         "evaluations pp-hetnet": 6,
         "evaluations pcp": 7,
         "larger grids": 5,
+        "to 20x20": 4,
+        "rivals": 11,
+        "large teams": 5,
     }
 
 
