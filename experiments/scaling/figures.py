@@ -22,8 +22,11 @@ AXES = {"env_steps": (1e-6, "environment steps (millions)"), "cpu_seconds": (1.0
 
 # Okabe and Ito's palette, as in the package's own curves.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+MATRICES_ABREAST = 3
+
 DASHED: Any = (0, (4, 1.5))
 DOTTED: Any = (0, (1, 1.5))
+DASH_DOTTED: Any = (0, (5, 1.2, 1, 1.2))
 
 
 def cost_figure(found: Sequence[Arm], output: Path) -> None:
@@ -132,10 +135,11 @@ def curves_figure(own: Sequence[Arm], output: Path) -> None:
     for place, (scale, label) in enumerate(AXES.values()):
         axes = figure.add_subplot(1, len(AXES), place + 1)
         colours = _colours(_line_name(arm) for arm in arms)
-        for arm in arms:
+        for line, arm in enumerate(arms):
             name = _line_name(arm)
             x, low, middle, high = band(arm, place)
-            style = _style(arm.about["stage"])
+            # Lines beyond the palette have its colours once more.
+            style = _style(arm.about["stage"]) if line < len(COLOURS) else DASH_DOTTED
             axes.plot(
                 x * scale, middle, color=colours[name], linestyle=style, linewidth=1.5, label=name
             )
@@ -174,9 +178,11 @@ def matrix_figure(
     """Steps taken by a team trained on one task (rows) and played on another (columns)."""
     if not matrices:
         return
-    figure = Figure(figsize=(4.4 * len(matrices), 3.4), layout="constrained")
+    columns = min(len(matrices), MATRICES_ABREAST)
+    lines = -(-len(matrices) // columns)
+    figure = Figure(figsize=(4.4 * columns, 3.4 * lines), layout="constrained")
     for place, (name, cells) in enumerate(matrices.items()):
-        axes = figure.add_subplot(1, len(matrices), place + 1)
+        axes = figure.add_subplot(lines, columns, place + 1)
         trained = list(dict.fromkeys(there for there, _ in cells))
         played = sorted({here for _, here in cells}, key=trained.index)
         success = np.full((len(trained), len(played)), np.nan)
