@@ -30,8 +30,8 @@ from sumajax.transfer import StoppedError
 
 RESULTS = Path(__file__).parents[1] / "results" / "scale"
 PROVENANCE = "provenance"
-REPLAYED: tuple[Part, ...] = ("pp40", "rect")
-"""Parts of whose first seed an episode is kept, to look at."""
+REPLAYED = "pp40-hetnet"
+"""The experiment of whose first seed an episode is kept, to look at."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def _finish(found: StudyRun, options: Options, episodes: int) -> None:
         results.add(found.study.name, found.seeds, rows)
         results.write()
         replay = found.directory / "replay.gif"
-        if found.study.part in REPLAYED and 0 in found.seeds and replay.exists():
+        if found.study.name == REPLAYED and 0 in found.seeds and replay.exists():
             shutil.copy(replay, options.output / f"replay-{found.study.name}.gif")
     keep_plan(found, options.output)
 

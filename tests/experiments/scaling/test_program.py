@@ -32,6 +32,7 @@ EPISODES = 16
 @pytest.fixture
 def options(monkeypatch, tmp_path):
     monkeypatch.setattr(Options, "studies", [TOY])
+    monkeypatch.setattr(program, "REPLAYED", TOY.name)
     monkeypatch.setattr(config, "EPOCH_STEPS", 2_000)  # one update of the toy's
     monkeypatch.setattr(runs, "limits", lambda task: (task.max_steps // 2, task.max_steps))
     return Options(output=tmp_path / "results", runs=tmp_path / "runs")
