@@ -75,9 +75,9 @@ def _arm(rows: Sequence[Row], cost: Any, found: Any) -> Arm:
         way = found["evaluations"].get(place) or found["curves"][place]
         points = [[point[unit] for unit in UNITS] + [point["steps_taken"]] for point in way]
         played = found["held_out"].get(place, [])
-        if zero_shot := _figure(played, row, ZERO_SHOT):
+        if zero_shot := figure(played, row, ZERO_SHOT):
             points.insert(0, [0.0, 0.0, zero_shot])
-        if end := _figure(played, row, END):
+        if end := figure(played, row, END):
             points.append([row[unit] for unit in UNITS] + [end])
         shift = np.array([*source.values(), 0.0])
         paths[seed] = np.array(points, float) + shift
@@ -88,7 +88,7 @@ def _place(row: Row) -> tuple[str, str, int]:
     return row["experiment"], row["stage"], row["seed"]
 
 
-def _figure(played: Sequence[Row], row: Row, when: str) -> float | None:
+def figure(played: Sequence[Row], row: Row, when: str) -> float | None:
     """Steps taken by sampled actions on the stage's own task, at the limit it is trained with."""
     wanted = (when, row["task"], "sampled", row["max_steps"])
     for one in played:

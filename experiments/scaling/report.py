@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.scaling.costs import LEVELS, UNITS, Arm, arms
+from experiments.scaling.costs import LEVELS, UNITS, Arm, arms, figure
 from experiments.scaling.figures import cost_figure, curves_figure, matrix_figure
 from experiments.scaling.plans import PARTS
-from experiments.scaling.results import Results, Row
+from experiments.scaling.results import KEY, Results, Row
 from experiments.scaling.runs import ELSEWHERE, END, ZERO_SHOT
 from sumajax.reporting import write_text
 
@@ -25,6 +25,8 @@ TITLES = {
     "short": "Short sources (0.5 M steps each), 20x20 with 10",
     "still": "Stages that end themselves, 20x20 with 10",
 }
+KEPT_AT = (100_000, 300_000, 1_000_000)
+"""Environment steps of a stage after which it should still be as good as what it began with."""
 HOW = """\
 Written by `python experiments/scale.py --rebuild` from the CSV files beside it; where each run
 comes from (command, commit, versions, machine, every setting) is in `provenance/`.
@@ -55,6 +57,11 @@ def write_report(results: Results) -> None:
         if matrix := _matrix_rows(own, results):
             text.append("Trained there (rows), played here (columns), sampled:\n")
             text.append(markdown(matrix))
+    transfers, above = above_zero_shot(results)
+    if above:
+        text.append("## Above their zero shot\n")
+        text.append(f"Of {transfers} transfers, over the starts on the way, at the task's limit:\n")
+        text.append(markdown(above))
     missing = [part for part in PARTS if not any(arm.about["part"] == part for arm in found)]
     if missing:
         text.append(f"Not run: {', '.join(missing)}.\n")
@@ -122,6 +129,32 @@ def name_of(arm: Arm) -> str:
     """The stage, and what its chain is called where it is no plain one."""
     words, stage = arm.about["words"], arm.about["stage"]
     return stage if words == "chain" else f"{words}: {stage}"
+
+
+# --- What a transfer keeps ---------------------------------------------------------------------
+
+
+def above_zero_shot(results: Results) -> tuple[int, list[Row]]:
+    """How many transfers there are, and a row for each that took more steps at one of `KEPT_AT`."""
+    transfers, found = 0, []
+    for stage in results.rows["stages"]:
+        place = {name: stage[name] for name in KEY}
+        own = [row for row in results.rows["held_out"] if place.items() <= row.items()]
+        zero_shot = figure(own, stage, ZERO_SHOT)
+        if zero_shot is None:
+            continue
+        transfers += 1
+        way = {
+            row["env_steps"]: row["steps_taken"]
+            for row in results.rows["evaluations"]
+            if place.items() <= row.items()
+        }
+        worse = [at for at in KEPT_AT if way.get(at, 0) > zero_shot]
+        if worse:
+            figures = {at: f"{way[at]:.1f}" if at in worse else "" for at in KEPT_AT}
+            cells = {f"{at * 1e-6:.1f} M": taken for at, taken in figures.items()}
+            found.append({**place, "zero shot": f"{zero_shot:.1f}", **cells})
+    return transfers, found
 
 
 # --- Costs -------------------------------------------------------------------------------------

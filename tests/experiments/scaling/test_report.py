@@ -7,7 +7,7 @@ import pytest
 
 from experiments.scaling.costs import arms
 from experiments.scaling.figures import band, cost_lines
-from experiments.scaling.report import cost_cell, spread, write_report
+from experiments.scaling.report import above_zero_shot, cost_cell, spread, write_report
 from experiments.scaling.results import COLUMNS, Results
 
 
@@ -141,6 +141,23 @@ def test_a_band_is_the_mean_and_range_over_seeds_at_each_point(results):
     np.testing.assert_array_equal(low, [60.0, 25.0, 14.5, 14.0])
     np.testing.assert_array_equal(high, [60.0, 180.0, 170.5, 170.0])
     np.testing.assert_array_equal(middle, (low + high) / 2)
+
+
+def test_who_fell_below_what_a_transfer_brought_is_told(results):
+    """Both seeds begin at 60; the second is at 180 after 0.02 M steps and at 170.5 after 0.04 M."""
+    assert above_zero_shot(results) == (2, [])  # not looked at then
+    for row in results.rows["evaluations"]:
+        row["env_steps"] *= 5
+    (row,) = above_zero_shot(results)[1]
+    assert row == {
+        "experiment": "pp20-hetnet",
+        "stage": "20x20",
+        "seed": 1,
+        "zero shot": "60.0",
+        "0.1 M": "180.0",
+        "0.3 M": "",
+        "1.0 M": "",
+    }
 
 
 def test_the_report_is_made_of_the_kept_files_alone(results):
