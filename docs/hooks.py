@@ -10,11 +10,12 @@ import re
 import runpy
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
+if TYPE_CHECKING:  # the tests ask which pages there are, and have no mkdocs
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -62,7 +63,9 @@ def place_of(path: Path) -> str | None:
     return None
 
 
-def on_files(files: Files, config: MkDocsConfig) -> Files:
+def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
+    from mkdocs.structure.files import File
+
     for folder, place in PLACES.items():
         if place:
             for path in sorted(linked(folder)):
@@ -77,7 +80,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: "Page", **_: Any) -> str:
     if page.file.src_uri == NOTEBOOK_PAGE:
         return markdown.replace(NOTEBOOK_HERE, notebook()[0])
     lies_in = Path(page.file.abs_src_path or ROOT).parent

@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -93,6 +94,25 @@ def test_links(page):
             assert section in {anchor(name) for name in headings(to)}, f"{link}#{section}"
     for file in re.findall(r"`((?:sumajax|experiments|tests)/[\w/.]+)`", text):
         assert list(ROOT.glob(file.replace("NAME", "*"))), file
+
+
+def test_every_page_of_the_site_is_in_its_navigation():
+    """Strict builds of the site refuse one that is not."""
+    hooks = runpy.run_path(str(DOCS / "hooks.py"))
+    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
+    for folder, place in hooks["PLACES"].items():
+        if place:
+            found = [file for file in hooks["linked"](folder) if file.suffix == ".md"]
+            pages |= {f"{place}/{file.relative_to(folder).as_posix()}" for file in found}
+
+    def listed(entry: Any) -> set[str]:
+        """Of a part of the navigation: a page, a list of parts, or a title with either."""
+        if isinstance(entry, str):
+            return {entry}
+        parts = entry.values() if isinstance(entry, dict) else entry
+        return set().union(*map(listed, parts))
+
+    assert listed(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]) == pages
 
 
 def test_pages_and_sections_that_code_cites():
