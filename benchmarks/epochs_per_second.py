@@ -45,7 +45,7 @@ PolicyName = Literal[
     "hetnet",
     "hetnet-binary",
 ]
-TaskName = Literal["pp-5x5-3p", "pp-10x10-5p", "pp-20x20-10p", "pcp-10x10-3p2c"]
+TaskName = Literal["pp-5x5-3p", "pp-10x10-5p", "pp-20x20-10p", "pcp-10x10-3p2c", "tj-medium-10c"]
 POLICY_NAMES: tuple[PolicyName, ...] = get_args(PolicyName)
 TASK_NAMES: tuple[TaskName, ...] = ("pp-5x5-3p", "pp-10x10-5p", "pp-20x20-10p", "pcp-10x10-3p2c")
 
@@ -204,13 +204,14 @@ def timed(train: Any, states: Any, worker: Worker) -> tuple[list[float], list[fl
 
 def make_task(name: TaskName) -> Any:
     """The environment of a task's name."""
-    from sumajax.environments import PredatorCapturePrey, PredatorPrey
+    from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
 
     return {
         "pp-5x5-3p": lambda: PredatorPrey(5, 3, vision=1, max_steps=80),
         "pp-10x10-5p": lambda: PredatorPrey(10, 5, vision=1, max_steps=200),
         "pp-20x20-10p": lambda: PredatorPrey(20, 10, vision=1, max_steps=400),
         "pcp-10x10-3p2c": lambda: PredatorCapturePrey(10, 3, 2, vision=1, max_steps=200),
+        "tj-medium-10c": lambda: TrafficJunction("medium"),
     }[name]()
 
 
