@@ -31,7 +31,8 @@ from sumajax.experiment import Experiment, Stage, run_experiment
 from sumajax.experiment.plan import check_seeds
 from sumajax.experiment.records import MODES, StageRecords
 from sumajax.experiment.run import Where
-from sumajax.learning import preset
+from sumajax.learning import LearnerConfig, preset
+from sumajax.learning.config import Critic
 from sumajax.reporting import metrics as metrics_file
 from sumajax.reporting import write_text
 from sumajax.upsampling import Fill, StateUpsampled
@@ -40,10 +41,10 @@ RESULTS = Path(__file__).parent / "results" / "traffic_junction"
 
 # --- What is run --------------------------------------------------------------------------------
 
-EPOCHS: dict[Difficulty, int] = {"easy": 70, "medium": 45, "hard": 25}
-"""Of 20,000 environment steps."""
-SOURCE_EPOCHS, TARGET_EPOCHS = 60, 30
-"""Of part transfer; training from scratch beside it has the target's."""
+LESSON_EPOCHS, SHARP_EPOCHS = 120, 30
+"""Of 20,000 environment steps: with rates that rise, then at the task's own rate."""
+TARGET_EPOCHS = LESSON_EPOCHS // 5
+"""Of medium after easy: a fifth of its lessons from scratch, and what scratch has beside it."""
 SOLVED = 0.8
 """Success, in the run's own comparison."""
 POLICY = "ic3net"
@@ -51,8 +52,10 @@ SETTINGS: dict[str, Any] = {"talk_always": True}
 """As the published program has it in this domain."""
 HOLD_UP = 0.3
 """Drivers learn to keep their distance from who may stop before anybody can gain by stopping."""
-LEARNER: dict[str, Any] = {"critic": "state", "entropy_weight": 0.01}
-"""Settings of the learner other than those of preset `fast`; docs/settings.md, Traffic Junction."""
+CRITIC: Critic = "state"
+LESSON_ENTROPY, SHARP_ENTROPY = 0.01, 0.001
+"""Weights of the bonus. These two and the critic are all that is not preset `fast`;
+docs/settings.md, Traffic Junction."""
 
 Part = Literal["easy", "medium", "hard", "transfer", "memory"]
 PARTS: tuple[Part, ...] = get_args(Part)
@@ -79,7 +82,7 @@ class Study:
         )
 
 
-def stage(
+def lessons(
     name: str, difficulty: Difficulty, epochs: int, start: str | None = None, **seen: Any
 ) -> Stage:
     """A task at rates that rise from an eighth to three eighths of its epochs, with hold-ups that
@@ -90,27 +93,40 @@ def stage(
     env: Environment = replace(task, rate_epochs=rise, hold_up=HOLD_UP)
     if seen:
         env = StateUpsampled(env, TrafficJunction("medium").shape[0], **seen)
-    return Stage(name, env, epochs, start, preset("fast", POLICY, **LEARNER))
+    return Stage(name, env, epochs, start, learner(LESSON_ENTROPY))
+
+
+def learner(entropy_weight: float) -> LearnerConfig:
+    return preset("fast", POLICY, critic=CRITIC, entropy_weight=entropy_weight)
+
+
+def taught(difficulty: Difficulty) -> tuple[Stage, ...]:
+    """Lessons, then the task itself with next to no bonus for choices that are not sharp."""
+    task, name = TrafficJunction(difficulty), f"{difficulty}-sharp"
+    return (
+        lessons(difficulty, difficulty, LESSON_EPOCHS),
+        Stage(name, task, SHARP_EPOCHS, difficulty, learner(SHARP_ENTROPY)),
+    )
 
 
 def transfer(fill: Fill) -> tuple[Stage, ...]:
     """Easy seen at 14x14, then medium."""
-    source = stage("easy", "easy", SOURCE_EPOCHS, fill=fill)
-    return source, stage("medium", "medium", TARGET_EPOCHS, "easy")
+    source = lessons("easy", "easy", LESSON_EPOCHS, fill=fill)
+    return source, lessons("medium", "medium", TARGET_EPOCHS, "easy")
 
 
 def studies(part: Part) -> list[Study]:
     """The experiments of a part."""
     if part == "transfer":
-        scratch = stage("scratch", "medium", TARGET_EPOCHS)
+        scratch = lessons("scratch", "medium", TARGET_EPOCHS)
         return [
             Study("transfer-blocks", (*transfer("blocks"), scratch)),
             Study("transfer-corner", transfer("corner")),
         ]
     if part == "memory":
-        fresh = stage("easy", "easy", EPOCHS["easy"])
-        return [Study("easy-fresh-memory", (fresh,), {**SETTINGS, "fresh_memory": True})]
-    return [Study(part, (stage(part, part, EPOCHS[part]),))]
+        settings = {**SETTINGS, "fresh_memory": True}
+        return [Study("easy-fresh-memory", taught("easy"), settings)]
+    return [Study(part, taught(part))]
 
 
 # --- What is kept -------------------------------------------------------------------------------
@@ -128,10 +144,8 @@ it (`end`). `curves`: training's own figures, at the rate of the epoch."""
 
 def rows_of(found: StudyRun) -> dict[str, list[Row]]:
     """The rows of a finished run, by kept file."""
-    records, experiment = (
-        StageRecords(found.directory / "stages.json"),
-        {"experiment": found.study.name},
-    )
+    records = StageRecords(found.directory / "stages.json")
+    experiment = {"experiment": found.study.name}
     curves = [
         # The process trains all seeds; each has its share of the time.
         {

@@ -68,9 +68,12 @@ def test_from_training_to_tables_and_nothing_twice(options, monkeypatch):
 
 def test_what_is_run_is_the_published_tasks_and_easy_at_mediums_size():
     for part in ("easy", "medium", "hard"):
-        ((stage,),) = (study.stages for study in studies(part))
-        assert stage.env.last_arrival_rate == TrafficJunction(part).arrival_rate
-        assert stage.env.rises
+        ((lessons, sharp),) = (study.stages for study in studies(part))
+        assert lessons.env.last_arrival_rate == TrafficJunction(part).arrival_rate
+        assert lessons.env.rises
+        assert lessons.env.hold_up
+        assert sharp.env == TrafficJunction(part)
+        assert sharp.start == lessons.name
     blocks, corner = studies("transfer")
     assert [unwrapped(s.env).difficulty for s in blocks.stages] == ["easy", "medium", "medium"]
     assert {s.env.state_shape for s in (*blocks.stages, *corner.stages)} == {(2, 14, 14)}
