@@ -12,28 +12,35 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the clone: `experiments` is a package of it
 
 from experiments.paper.results import write_csv
-from experiments.scaling.program import keep_plan, locked, note_session
-from experiments.scaling.results import read_csv
-from experiments.scaling.runs import StudyRun, study_runs
+from experiments.studies import (
+    KEY,
+    Row,
+    StudyRun,
+    curves_of,
+    keep_plan,
+    locked,
+    note_session,
+    read_csv,
+    replaced,
+    study_runs,
+)
 from sumajax.cli.options import keep_compiled, parse, plain_errors
 from sumajax.environments.roads import Difficulty
 from sumajax.environments.traffic_junction import TrafficJunction, with_curriculum
 from sumajax.environments.types import Environment
 from sumajax.evaluation import EPISODES
-from sumajax.experiment import Experiment, Stage, run_experiment
+from sumajax.experiment import Experiment, Stage
 from sumajax.experiment.plan import check_seeds
 from sumajax.experiment.records import MODES, StageRecords
-from sumajax.experiment.run import Where
 from sumajax.learning import LearnerConfig, preset
 from sumajax.learning.config import Critic
-from sumajax.reporting import metrics as metrics_file
 from sumajax.reporting import write_text
 from sumajax.upsampling import Fill, StateUpsampled
 
@@ -131,8 +138,6 @@ def studies(part: Part) -> list[Study]:
 
 # --- What is kept -------------------------------------------------------------------------------
 
-Row = dict[str, Any]
-KEY = ("experiment", "stage", "seed")
 FIGURES = ("success", "return", *TrafficJunction.figure_names)
 COLUMNS = {
     "held_out": (*KEY, "when", "env_steps", "mode", "episodes", *FIGURES),
@@ -142,26 +147,15 @@ COLUMNS = {
 it (`end`). `curves`: training's own figures, at the rate of the epoch."""
 
 
-def rows_of(found: StudyRun) -> dict[str, list[Row]]:
+def rows_of(found: StudyRun[Study]) -> dict[str, list[Row]]:
     """The rows of a finished run, by kept file."""
     records = StageRecords(found.directory / "stages.json")
-    experiment = {"experiment": found.study.name}
-    curves = [
-        # The process trains all seeds; each has its share of the time.
-        {
-            **row,
-            **experiment,
-            "stage": row["arm"],
-            "cpu_seconds": row["cpu_seconds"] / len(found.seeds),
-        }
-        for row in metrics_file.read_metrics(found.directory / "metrics.csv")
-    ]
     held_out = [
-        {**experiment, "stage": stage.name, **row}
+        {"experiment": found.study.name, "stage": stage.name, **row}
         for stage in found.experiment.stages
         for row in played(records[stage.name], found.seeds)
     ]
-    return {"held_out": held_out, "curves": curves}
+    return {"held_out": held_out, "curves": curves_of(found, ("success",))}
 
 
 def played(record: Mapping[str, Any], seeds: Sequence[int]) -> Iterator[Row]:
@@ -178,15 +172,12 @@ def played(record: Mapping[str, Any], seeds: Sequence[int]) -> Iterator[Row]:
                 yield {**about, "episodes": evaluation[mode]["episodes"], **figures}
 
 
-def keep(rows: Mapping[str, list[Row]], output: Path) -> None:
-    """Puts the rows of a run in the place of all of its experiment and seeds."""
-    for name, new in rows.items():
+def keep(found: StudyRun[Study], output: Path) -> None:
+    """Puts the rows of a finished run in the place of all of its experiment and seeds."""
+    for name, new in rows_of(found).items():
         file = output / f"{name}.csv"
-        replaced = {(row["experiment"], row["seed"]) for row in new}
-        kept = [r for r in read_csv(file) if (r["experiment"], r["seed"]) not in replaced]
-        # Within an experiment and seed in the order in which they were trained.
-        rows_now = sorted(kept + new, key=lambda row: (row["experiment"], row["seed"]))
-        write_csv(file, COLUMNS[name], rows_now)
+        rows = replaced(read_csv(file), found.study.name, found.seeds, new)
+        write_csv(file, COLUMNS[name], rows)
 
 
 # --- Tables -------------------------------------------------------------------------------------
@@ -258,13 +249,11 @@ def run(options: Options) -> None:
       ValueError, OSError: one sentence each.
     """
     for study in [] if options.rebuild else [s for part in options.parts for s in studies(part)]:
-        # Of a study nothing but its name and `experiment` is asked for.
-        for found in study_runs(cast(Any, study), options.seeds, options.runs, devices=1):
+        for found in study_runs(study, options.seeds, options.runs, devices=1):
             note_session(found, options.output)
-            if not found.has_ended:
-                run_experiment(found.experiment, found.directory, Where(devices=1))
+            found.train()
             with locked(options.output):
-                keep(rows_of(found), options.output)
+                keep(found, options.output)
             keep_plan(found, options.output)
     held_out = read_csv(options.output / "held_out.csv")
     if not held_out:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.scaling.results import Results, Row
+from experiments.scaling.results import Results
 from experiments.scaling.runs import END, ZERO_SHOT
+from experiments.studies import Row
 
 LEVELS = (3.0, 2.0, 1.5)
 """Times the shortest paths."""

@@ -11,7 +11,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocat
 
 from experiments.scaling.costs import Arm
 from experiments.scaling.plans import SCRATCH
-from experiments.scaling.results import Row
+from experiments.studies import Row
 from sumajax.reporting.curves import FAINT, INK, dress, write_png
 
 LEVEL = 2.0

@@ -1,35 +1,22 @@
 """`python experiments/scale.py`: its options, and what it does with them."""
 
-import json
-import os
-import shlex
 import shutil
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from filelock import FileLock
-
-from experiments.paper.results import commit, machine
 from experiments.scaling.plans import PARTS, VARIANTS, Part, Study, studies
 from experiments.scaling.report import write_report
 from experiments.scaling.results import Results
-from experiments.scaling.runs import StudyRun, study_runs
+from experiments.scaling.runs import finish
+from experiments.studies import StudyRun, keep_plan, locked, note_session, study_runs
 from sumajax.cli.options import keep_compiled, parse, plain_errors
 from sumajax.cli.transfer import MAX_DEVICES
-from sumajax.description import versions
 from sumajax.evaluation import EPISODES
 from sumajax.experiment.plan import check_seeds
 from sumajax.learning import parallel
-from sumajax.reporting import write_json
 from sumajax.transfer import StoppedError
 
 RESULTS = Path(__file__).parents[1] / "results" / "scale"
-PROVENANCE = "provenance"
 REPLAYED = "pp40-hetnet"
 """The experiment of whose first seed an episode is kept, to look at."""
 
@@ -105,13 +92,13 @@ def run(options: Options, episodes: int = EPISODES) -> None:
     print(f"wrote {options.output / 'tables.md'}")
 
 
-def _finish(found: StudyRun, options: Options, episodes: int) -> None:
+def _finish(found: StudyRun[Study], options: Options, episodes: int) -> None:
     """Runs what is missing of an experiment and keeps it."""
     name = f"{found.study.name}, seeds {' '.join(map(str, found.seeds))}"
     print(f"== {name}", flush=True)
     note_session(found, options.output)
     try:
-        rows = found.finish(episodes)
+        rows = finish(found, episodes)
     except StoppedError as error:  # no rows then; the others go on
         print(f"{name}: {error}", flush=True)
         return
@@ -123,47 +110,6 @@ def _finish(found: StudyRun, options: Options, episodes: int) -> None:
         if found.study.name == REPLAYED and 0 in found.seeds and replay.exists():
             shutil.copy(replay, options.output / f"replay-{found.study.name}.gif")
     keep_plan(found, options.output)
-
-
-@contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """The kept files, for one program at a time: several may train, each in runs of its own."""
-    directory.mkdir(parents=True, exist_ok=True)
-    with FileLock(directory / ".lock"):
-        yield
-
-
-# --- Where the rows come from ------------------------------------------------------------------
-
-
-def _provenance(found: StudyRun, output: Path) -> Path:
-    return output / PROVENANCE / f"{found.study.name}-{found.directory.name}.json"
-
-
-def note_session(found: StudyRun, output: Path) -> None:
-    """Adds a session to the run's file, unless the run has ended: command, commit, machine."""
-    file = _provenance(found, output)
-    if found.has_ended and file.exists():
-        return
-    file.parent.mkdir(parents=True, exist_ok=True)
-    before = json.loads(file.read_text()) if file.exists() else {}
-    now = {
-        "command": shlex.join(["python", *sys.argv]),
-        "commit": commit(),
-        "versions": versions(),
-        "machine": machine(),
-        "load_before": os.getloadavg()[0],
-        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-    }
-    about = {"experiment": found.study.name, "seeds": found.seeds}
-    write_json(file, {**before, **about, "sessions": [*before.get("sessions", []), now]})
-
-
-def keep_plan(found: StudyRun, output: Path) -> None:
-    """Adds what was trained, resolved: tasks, starts and every setting of the learner."""
-    file = _provenance(found, output)
-    plan: Any = json.loads((found.directory / "config.json").read_text())["experiment"]
-    write_json(file, {**json.loads(file.read_text()), "plan": plan})
 
 
 def main() -> None:

@@ -8,8 +8,9 @@ import numpy as np
 from experiments.scaling.costs import LEVELS, UNITS, Arm, arms, figure
 from experiments.scaling.figures import cost_figure, curves_figure, matrix_figure
 from experiments.scaling.plans import PARTS
-from experiments.scaling.results import KEY, Results, Row
+from experiments.scaling.results import Results
 from experiments.scaling.runs import ELSEWHERE, END, ZERO_SHOT
+from experiments.studies import KEY, Row
 from sumajax.reporting import write_text
 
 MODES_SHOWN = ("sampled", "greedy")

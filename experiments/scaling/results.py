@@ -4,7 +4,6 @@ Tables and figures are made of these files alone. A row belongs to one experimen
 and a run replaces all rows of its experiment and seeds.
 """
 
-import csv
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -15,16 +14,13 @@ import numpy as np
 
 from experiments.paper.results import write_csv
 from experiments.scaling.plans import Study
+from experiments.studies import KEY, Row, StudyRun, curves_of, read_csv, replaced
 from sumajax.environments.wrapper import unwrapped
 from sumajax.evaluation import shortest_path_steps
 from sumajax.experiment import Experiment, Stage
 from sumajax.experiment.records import StageRecords
 from sumajax.experiment.summary import grid_label
-from sumajax.reporting import metrics as metrics_file
 
-Row = dict[str, Any]
-
-KEY = ("experiment", "stage", "seed")
 COLUMNS = {
     "stages": (
         *KEY,
@@ -50,9 +46,6 @@ COLUMNS = {
 `evaluations` held-out ones on the way, `held_out` those of what a stage begins and ends with, on
 its own task and on the others of its chain. `bound`: the shortest paths."""
 
-WORDS = {"arm", "experiment", "stage", "part", "policy", "words", "after", "task", "when", "mode"}
-WHOLE = {"seed", "epoch", "epochs", "env_steps", "max_steps", "side", "limit", "episodes"}
-
 PLAYED = "held_out.csv"
 """In a run's directory: the rows of `held_out` that are known."""
 
@@ -77,55 +70,18 @@ class Results:
     def add(self, experiment: str, seeds: Sequence[int], rows: dict[str, list[Row]]) -> None:
         """Puts the rows of a run in the place of all of its experiment and seeds."""
         for name in COLUMNS:
-            kept = [
-                row
-                for row in self.rows[name]
-                if row["experiment"] != experiment or row["seed"] not in seeds
-            ]
-            # By experiment and seed; within them in the order in which they were trained.
-            self.rows[name] = sorted(
-                kept + rows[name], key=lambda row: (row["experiment"], row["seed"])
-            )
-
-
-def read_csv(path: Path) -> list[Row]:
-    """Rows with their types; none where there is no file."""
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return [
-            {name: _value(name, cell) for name, cell in row.items()} for row in csv.DictReader(file)
-        ]
-
-
-def _value(column: str, cell: str) -> Any:
-    if column in WORDS:
-        return cell
-    if column in WHOLE:
-        return int(cell)
-    return float(cell) if cell else float("nan")
+            self.rows[name] = replaced(self.rows[name], experiment, seeds, rows[name])
 
 
 # --- From a run's directory --------------------------------------------------------------------
 
 
-def rows_of_run(study: Study, experiment: Experiment, directory: Path) -> dict[str, list[Row]]:
+def rows_of_run(found: StudyRun[Study]) -> dict[str, list[Row]]:
     """The rows of a finished run, by kept file."""
-    metrics = metrics_file.read_metrics(directory / "metrics.csv")
+    study, experiment, directory = found.study, found.experiment, found.directory
     summary = json.loads((directory / "summary.json").read_text())
     records = StageRecords(directory / "stages.json")
-    at_once = len(experiment.seeds)
-    curves = [
-        {
-            "experiment": study.name,
-            "stage": row["arm"],
-            "seed": row["seed"],
-            **{n: row[n] for n in ("epoch", "env_steps", "steps_taken", "success")},
-            # The process trains all seeds; each has its share of the time.
-            "cpu_seconds": row["cpu_seconds"] / at_once,
-        }
-        for row in metrics
-    ]
+    curves = curves_of(found, ("steps_taken", "success"))
     by_place = {(r["stage"], r["seed"], r["env_steps"]): r["cpu_seconds"] for r in curves}
     on_the_way = read_csv(directory / "evaluations.csv")
     bounds: dict[Any, Any] = {

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import pytest
 
+from experiments import studies as ground
 from experiments import traffic_junction
-from experiments.scaling.results import read_csv
+from experiments.studies import read_csv
 from experiments.traffic_junction import Options, Study, run, studies
 from sumajax.environments import TrafficJunction
 from sumajax.environments.wrapper import unwrapped
@@ -59,7 +60,7 @@ def test_from_training_to_tables_and_nothing_twice(options, monkeypatch):
     def no_more(*args, **kwargs):
         raise AssertionError("nothing is left to do")
 
-    monkeypatch.setattr(traffic_junction, "run_experiment", no_more)
+    monkeypatch.setattr(ground, "run_experiment", no_more)
     run(options)
     run(replace(options, rebuild=True))
     assert (options.output / "tables.md").read_text() == text

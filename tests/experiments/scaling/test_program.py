@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments import studies
 from experiments.scaling import program, runs
 from experiments.scaling.plans import Study, chain_of, with_scratch
 from experiments.scaling.program import Options, run
 from experiments.scaling.results import Results
-from experiments.scaling.runs import study_runs
 from sumajax.environments import PredatorPrey
 from sumajax.learning import LearnerConfig, config
 from sumajax.upsampling import StateUpsampled
@@ -72,7 +72,7 @@ def test_from_training_to_tables_and_nothing_twice(options, monkeypatch):
     def no_more(*args, **kwargs):
         raise AssertionError("nothing is left to do")
 
-    monkeypatch.setattr(runs, "run_experiment", no_more)
+    monkeypatch.setattr(studies, "run_experiment", no_more)
     monkeypatch.setattr(runs, "evaluate", no_more)
     run(options, EPISODES)
     run(replace(options, rebuild=True), EPISODES)
@@ -80,24 +80,11 @@ def test_from_training_to_tables_and_nothing_twice(options, monkeypatch):
     assert len(json.loads(file.read_text())["sessions"]) == 1
 
 
-def test_seeds_that_are_added_have_a_run_of_their_own(tmp_path):
-    def groups(*seeds):
-        return [found.seeds for found in study_runs(TOY, seeds, tmp_path, 1)]
-
-    assert groups(0, 1) == [(0, 1)]
-    for name in ("seeds-0-1", "seeds-4"):
-        (tmp_path / TOY.name / name).mkdir(parents=True)
-        (tmp_path / TOY.name / name / "config.json").write_text("{}")
-    assert groups(0, 1) == [(0, 1)]
-    assert groups(1, 2, 3) == [(0, 1), (2, 3)]
-    assert groups(4) == [(4,)]
-
-
 def test_a_seed_without_an_end_is_told_of_and_the_others_go_on(options, monkeypatch, capsys):
     def stops(*args):
         raise program.StoppedError("no seed of the 3x3 stage is left")
 
-    monkeypatch.setattr(program.StudyRun, "finish", stops)
+    monkeypatch.setattr(program, "finish", stops)
     with pytest.raises(ValueError, match="holds no results; run a part first"):
         run(options, EPISODES)
     assert "toy-ic3net, seeds 0: no seed of the 3x3 stage is left" in capsys.readouterr().out
