@@ -84,7 +84,9 @@ def _of_own_source(variant: str, share: float = 1.0, **changes: Any) -> Arm:
     return _of_unchanged_source(variant, start=source, **changes)
 
 
-AblationName = Literal["corner", "mass", "encoder", "optimiser", "short-source", "lab-gap"]
+AblationName = Literal[
+    "corner", "mass", "encoder", "optimiser", "short-source", "lab-gap", "published-start"
+]
 ABLATIONS: dict[str, Ablation] = {
     "corner": Ablation(
         {
@@ -121,6 +123,16 @@ ABLATIONS: dict[str, Ablation] = {
             ),
         },
         beside_unchanged=False,
+    ),
+    "published-start": Ablation(
+        {
+            "(g) encoders started as published, upsampled": _of_own_source(
+                "published-start", encoder="flat_published"
+            ),
+            "(g) from scratch, encoders started as published": replace(
+                SCRATCH, name="scratch-published-start", encoder="flat_published", brief=True
+            ),
+        },
     ),
 }
 """By `AblationName`, in the order of the table."""
