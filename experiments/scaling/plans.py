@@ -89,6 +89,7 @@ VARIANTS = {
     "ic3net-talking": Variant("ic3net", {"message": "talking"}),
     "ic3net-max": Variant("ic3net", {"message": "max"}),
     "tarmac-ic3net": Variant("tarmac-ic3net"),
+    "tarmac-ic3net-twice": Variant("tarmac-ic3net", {"comm_passes": 2}),
     "magic": Variant("magic"),
 }
 
