@@ -45,8 +45,11 @@ LICENCE = "MIT"
 PAGE = Path(__file__).parents[1] / "docs" / "pretrained.md"
 TABLE = "<!-- python -m experiments.pretrained writes the table -->"
 END = "<!-- end of the table -->"
-STUDY = "scale.py"
-"""Of the programs that train, the one that is not a part of `sumajax`."""
+PROGRAMS = {
+    "scale.py": ("python", "-m", "experiments.scale"),
+    **{f"{name}_transfer.py": ("sumajax", "transfer", name) for name in DOMAINS},
+}
+"""What the card calls the programs of a clone; any other is `sumajax` itself."""
 PRIVATE = ("--output", "--runs")
 """Options that say where a run was written, and nothing of what it was."""
 
@@ -204,8 +207,7 @@ def command_of(arguments: list[str]) -> str:
             skipped = True
         elif not skipped:
             kept.append(argument)
-    of_a_clone = Path(arguments[0]).name == STUDY
-    program = ["python", "-m", f"experiments.{Path(STUDY).stem}"] if of_a_clone else ["sumajax"]
+    program = PROGRAMS.get(Path(arguments[0]).name, ("sumajax",))
     return shlex.join([*program, *kept])
 
 

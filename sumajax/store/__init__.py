@@ -3,7 +3,7 @@
     policies/NAME.json    the card: what it is of, how it was made, what it reaches
     policies/NAME.npz     the parameters
 
-All policies together are to stay below 4 MB, so that everybody who installs the package gets them.
+All policies together are to stay below 4 MiB, so that everybody who installs the package gets them.
 A matrix is therefore kept as whole numbers from -63 to 63 with a float32 scale for each of its
 columns; everything smaller is float32. The card's figures are those of the parameters that come
 back, not of the ones that training ended with. `python -m experiments.pretrained RUN` makes entries

@@ -148,6 +148,8 @@ def test_a_command_says_no_places(given, kept):
     assert command_of(["/home/somebody/bin/sumajax", *given]) == kept
     of_study = command_of(["experiments/scale.py", "--seeds", "0", "1", "--runs", "/tmp/runs"])
     assert of_study == "python -m experiments.scale --seeds 0 1"
+    of_pcp = command_of(["experiments/pcp_transfer.py", "--seeds", "2"])
+    assert of_pcp == "sumajax transfer pcp --seeds 2"
 
 
 def test_a_run_that_is_not_finished_is_refused(run, tmp_path):
