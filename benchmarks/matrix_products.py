@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from sumajax.environments.types import Environment
+from sumajax.environments.types import Environment, agents_leave
 from sumajax.policies import Policy
 
 if TYPE_CHECKING:  # of an interface that may move
@@ -62,7 +62,10 @@ def step_products(env: Environment, policy: Policy, num_envs: int) -> Counter[Pr
     mine = jax.ShapeDtypeStruct((num_envs, env.num_agents, features.shape[-1]), jnp.float32)
     view = jax.ShapeDtypeStruct((num_envs, env.num_agents, *team.view_shape), jnp.float32)
     noise = jax.eval_shape(lambda: policy.sample_noise(key, (num_envs,)))
-    return products(policy.step, params, carry, mine, view, noise)
+    alive = (
+        jax.ShapeDtypeStruct((num_envs, env.num_agents), jnp.bool_) if agents_leave(env) else None
+    )
+    return products(policy.step, params, carry, mine, view, noise, alive)
 
 
 def _gather(jaxpr: "Jaxpr", times: int = 1) -> Iterator[tuple[Product, int]]:

@@ -30,8 +30,8 @@ class Options:
     20x40. rivals: what else makes a small task fit. dilution: policies on large teams. brief,
     short: sources of 0.3 and of 0.5 M steps each. still: stages that end themselves."""
     policies: tuple[str, ...] = ()
-    """hetnet, ic3net, ic3net-talking, ic3net-max, tarmac-ic3net, magic; each part's own if not
-    given."""
+    """hetnet, ic3net, ic3net-talking, ic3net-max, tarmac-ic3net, tarmac-ic3net-twice (two rounds of
+    messages), magic; each part's own if not given."""
     only: tuple[str, ...] = ()
     """Of these parts only the experiments called so, as rivals-blank-hetnet."""
     seeds: tuple[int, ...] = (0,)

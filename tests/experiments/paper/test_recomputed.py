@@ -22,6 +22,7 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*.md")),
     RESULTS / "scale" / "README.md",
 ]
+FIGURES = {"collisions_per_car": 3, "mean_delay": 2, "cars_through": 1}  # digits
 MARK = re.compile(r"<!-- recomputed: ([^>]*?) -->\n\|.*\n\|[-|]*\n((?:\|.*\n)+)")
 
 EXPERIMENTS = ("pp-ic3net", "pp-magic", "pp-hetnet", "pcp-hetnet-2p1c", "pcp-hetnet-3p2c")
@@ -352,6 +353,33 @@ def kept(file, **cells):
     return [row for row in read(f"scale/{file}") if cells.items() <= row.items()]
 
 
+LESSONS = {f"{difficulty}-sharp": difficulty for difficulty in ("easy", "medium", "hard")}
+
+
+def junction(title):
+    """Of a stage's end: steps with its lessons, success and the domain's own figures."""
+    experiment, stage = re.search(r"`([\w-]+)/([\w-]+)`", title).groups()
+    ends = [
+        row
+        for row in read("traffic_junction/held_out")
+        if (row["experiment"], row["when"]) == (experiment, "end")
+    ]
+    assert {row["episodes"] for row in ends} == {"1024"}
+
+    def of(stage, mode, column):
+        place = (stage, mode)
+        return [float(r[column]) for r in ends if (r["stage"], r["mode"]) == place]
+
+    steps = [of(name, "sampled", "env_steps")[0] for name in (stage, LESSONS.get(stage)) if name]
+    figures = [of_means(of(stage, "sampled", name), digits) for name, digits in FIGURES.items()]
+    return [
+        f"{len(of(stage, 'sampled', 'success'))}",
+        f"{sum(steps) / 1e6:.2f} M",
+        *(of_means(of(stage, mode, "success"), 3) for mode in ("sampled", "greedy")),
+        *figures,
+    ]
+
+
 TABLES = {
     "main": main,
     "ablations pp-ic3net": ablations("pp-ic3net"),
@@ -365,6 +393,7 @@ TABLES = {
     "to 20x20": on_20x20,
     "rivals": on_20x20,
     "large teams": on_20x20,
+    "traffic junction": junction,
 }
 
 
@@ -406,7 +435,8 @@ def test_every_table_is_found():
         "larger grids": 5,
         "to 20x20": 4,
         "rivals": 11,
-        "large teams": 5,
+        "large teams": 6,
+        "traffic junction": 7,
     }
 
 
