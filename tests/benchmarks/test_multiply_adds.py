@@ -6,7 +6,7 @@ import pytest
 from matrix_products import Product, multiply_adds, products, step_products
 from multiply_adds import COUNTS, of_step, tarmac
 
-from sumajax.environments import PredatorCapturePrey, PredatorPrey
+from sumajax.environments import PredatorCapturePrey, PredatorPrey, TrafficJunction
 from sumajax.policies import POLICIES, TeamSpec, make_policy
 
 PP_SMALL, PP_LARGE = (PredatorPrey(10, n, vision=1, max_steps=200) for n in (3, 5))
@@ -46,6 +46,13 @@ def test_ic3net_does_what_was_published_less_what_the_table_holds():
     merge, messages = 5 * 128 * 128, 5 * 5 * 128
     done = multiply_adds(step_products(PP_LARGE, make_policy("ic3net", PP_LARGE), 1))
     assert done == of_step("ic3net", PP_LARGE) - merge - messages
+
+
+def test_a_team_that_comes_and_goes_does_what_one_that_stays_does():
+    """As many agents, with as many actions to choose from: masks are no products."""
+    medium = TrafficJunction("medium")
+    done = multiply_adds(step_products(medium, make_policy("ic3net", medium), 1))
+    assert done == of_step("ic3net", medium) - 10 * 128 * 128 - 10 * 10 * 128
 
 
 def test_tarmac_does_what_ic3net_does_and_a_little():
