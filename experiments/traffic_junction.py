@@ -51,7 +51,8 @@ RESULTS = Path(__file__).parent / "results" / "traffic_junction"
 LESSON_EPOCHS, SHARP_EPOCHS = 120, 30
 """Of 20,000 environment steps: with rates that rise, then at the task's own rate."""
 TARGET_EPOCHS = LESSON_EPOCHS // 5
-"""Of medium after easy: a fifth of its lessons from scratch, and what scratch has beside it."""
+"""Of a task after a smaller one: a fifth of its lessons from scratch, and what scratch has beside
+it."""
 SOLVED = 0.8
 """Success, in the run's own comparison."""
 POLICY = "ic3net"
@@ -64,8 +65,13 @@ LESSON_ENTROPY, SHARP_ENTROPY = 0.01, 0.001
 """Weights of the bonus. These two and the critic are all that is not preset `fast`;
 docs/settings.md, Traffic Junction."""
 
-Part = Literal["easy", "medium", "hard", "transfer", "memory"]
+Part = Literal["easy", "medium", "hard", "transfer", "transfer-hard", "memory"]
 PARTS: tuple[Part, ...] = get_args(Part)
+SMALLER = {
+    "transfer": (TrafficJunction("easy"), TrafficJunction("medium")),
+    "transfer-hard": (TrafficJunction("hard", size=9), TrafficJunction("hard")),
+}
+"""Of a part: the task that is seen at the size of the one after it."""
 
 
 @dataclass(frozen=True)
@@ -90,16 +96,16 @@ class Study:
 
 
 def lessons(
-    name: str, difficulty: Difficulty, epochs: int, start: str | None = None, **seen: Any
+    name: str, task: TrafficJunction, epochs: int, start: str | None = None, **seen: Any
 ) -> Stage:
     """A task at rates that rise from an eighth to three eighths of its epochs, with hold-ups that
-    end two eighths later; seen at medium's size if `seen` says how.
+    end two eighths later; seen at another size if `seen` says at which and how.
     """
     rise = (epochs // 8, 3 * epochs // 8)
-    task = with_curriculum(TrafficJunction(difficulty), epochs)
-    env: Environment = replace(task, rate_epochs=rise, hold_up=HOLD_UP)
+    rising = with_curriculum(task, epochs)
+    env: Environment = replace(rising, rate_epochs=rise, hold_up=HOLD_UP)
     if seen:
-        env = StateUpsampled(env, TrafficJunction("medium").shape[0], **seen)
+        env = StateUpsampled(env, **seen)
     return Stage(name, env, epochs, start, learner(LESSON_ENTROPY))
 
 
@@ -111,24 +117,31 @@ def taught(difficulty: Difficulty) -> tuple[Stage, ...]:
     """Lessons, then the task itself with next to no bonus for choices that are not sharp."""
     task, name = TrafficJunction(difficulty), f"{difficulty}-sharp"
     return (
-        lessons(difficulty, difficulty, LESSON_EPOCHS),
+        lessons(difficulty, task, LESSON_EPOCHS),
         Stage(name, task, SHARP_EPOCHS, difficulty, learner(SHARP_ENTROPY)),
     )
 
 
-def transfer(fill: Fill) -> tuple[Stage, ...]:
-    """Easy seen at 14x14, then medium."""
-    source = lessons("easy", "easy", LESSON_EPOCHS, fill=fill)
-    return source, lessons("medium", "medium", TARGET_EPOCHS, "easy")
+def transfer(small: TrafficJunction, large: TrafficJunction, fill: Fill) -> tuple[Stage, ...]:
+    """The small task seen at the size of the large one, then that."""
+    source = lessons(_name(small), small, LESSON_EPOCHS, size=large.shape[0], fill=fill)
+    return source, lessons(_name(large), large, TARGET_EPOCHS, source.name)
+
+
+def _name(task: TrafficJunction) -> str:
+    """Its difficulty, with its size where that is another than published."""
+    published = task == TrafficJunction(task.difficulty)
+    return task.difficulty if published else f"{task.difficulty}-{task.size}"
 
 
 def studies(part: Part) -> list[Study]:
     """The experiments of a part."""
-    if part == "transfer":
-        scratch = lessons("scratch", "medium", TARGET_EPOCHS)
+    if part == "transfer" or part == "transfer-hard":
+        small, large = SMALLER[part]
+        scratch = lessons("scratch", large, TARGET_EPOCHS)
         return [
-            Study("transfer-blocks", (*transfer("blocks"), scratch)),
-            Study("transfer-corner", transfer("corner")),
+            Study(f"{part}-blocks", (*transfer(small, large, "blocks"), scratch)),
+            Study(f"{part}-corner", transfer(small, large, "corner")),
         ]
     if part == "memory":
         settings = {**SETTINGS, "fresh_memory": True}
@@ -224,7 +237,8 @@ class Options:
 
     parts: tuple[Part, ...] = PARTS
     """easy, medium, hard: as published. transfer: easy seen at 14x14, then medium, by blocks and by
-    padding, and medium from scratch beside it. memory: easy, newcomers without their slot's
+    padding, and medium from scratch beside it. transfer-hard: the same from hard 9x9 to 18x18.
+    memory: easy, newcomers without their slot's
     memory."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Trained side by side in one run; seeds that are added later have a run of their own."""

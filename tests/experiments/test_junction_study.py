@@ -78,6 +78,9 @@ def test_what_is_run_is_the_published_tasks_and_easy_at_mediums_size():
     blocks, corner = studies("transfer")
     assert [unwrapped(s.env).difficulty for s in blocks.stages] == ["easy", "medium", "medium"]
     assert {s.env.state_shape for s in (*blocks.stages, *corner.stages)} == {(2, 14, 14)}
+    hard, _ = studies("transfer-hard")
+    assert [unwrapped(s.env).size for s in hard.stages] == [9, 18, 18]
+    assert {s.env.state_shape for s in hard.stages} == {(2, 18, 18)}
     assert blocks.stages[1].epochs == blocks.stages[2].epochs == corner.stages[1].epochs
 
 
