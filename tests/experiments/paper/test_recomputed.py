@@ -441,7 +441,7 @@ def test_every_table_is_found():
         "to 20x20": 4,
         "rivals": 11,
         "large teams": 6,
-        "traffic junction": 12,
+        "traffic junction": 13,
     }
 
 
