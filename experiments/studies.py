@@ -18,7 +18,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from filelock import FileLock
 
-from experiments.paper.results import commit, machine
+from experiments.paper.results import Row, commit, machine, typed
 from sumajax.description import versions
 from sumajax.experiment import Experiment, run_experiment
 from sumajax.experiment.run import Run, Where
@@ -91,12 +91,8 @@ def study_runs(study: S, seeds: Sequence[int], runs: Path, devices: int) -> list
 
 # --- Rows ---------------------------------------------------------------------------------------
 
-Row = dict[str, Any]
-
 KEY = ("experiment", "stage", "seed")
 """What every row is of."""
-WORDS = {"arm", "experiment", "stage", "part", "policy", "words", "after", "task", "when", "mode"}
-WHOLE = {"seed", "epoch", "epochs", "env_steps", "max_steps", "side", "limit", "episodes"}
 
 
 def read_csv(path: Path) -> list[Row]:
@@ -105,16 +101,8 @@ def read_csv(path: Path) -> list[Row]:
         return []
     with open(path, newline="") as file:
         return [
-            {name: _value(name, cell) for name, cell in row.items()} for row in csv.DictReader(file)
+            {name: typed(name, cell) for name, cell in row.items()} for row in csv.DictReader(file)
         ]
-
-
-def _value(column: str, cell: str) -> Any:
-    if column in WORDS:
-        return cell
-    if column in WHOLE:
-        return int(cell)
-    return float(cell) if cell else float("nan")
 
 
 def replaced(

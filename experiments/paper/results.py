@@ -54,8 +54,15 @@ COLUMNS = {
 """The kept files, each with its columns. `seconds` of a curve is the wall time of its arm with
 `seeds_at_once` seeds training side by side; `env_steps` and `seconds` count the arm alone."""
 
-WHOLE = {"seed", "epoch", "env_steps", "seeds_at_once", "episodes", "epochs"}
-WORDS = {"experiment", "arm", "preset", "mode", "task", "machine", "commit"}
+WHOLE = {
+    *("seed", "epoch", "env_steps", "seeds_at_once", "episodes", "epochs"),
+    *("max_steps", "side", "limit"),
+}
+WORDS = {
+    *("experiment", "arm", "preset", "mode", "task", "machine", "commit"),
+    *("stage", "part", "policy", "words", "after", "when"),
+}
+"""Columns of kept files, of the other studies' too, that are no numbers with a fraction."""
 
 Row = dict[str, Any]
 
@@ -346,14 +353,15 @@ def _read(path: Path, name: str) -> list[Row]:
         if tuple(reader.fieldnames or ()) != COLUMNS[name]:
             raise ValueError(f"{path} does not have the columns {', '.join(COLUMNS[name])}.")
         try:
-            return [{column: _value(column, row[column]) for column in row} for row in reader]
+            return [{column: typed(column, row[column]) for column in row} for row in reader]
         except (ValueError, TypeError) as error:
             raise ValueError(
                 f"{path}, line {reader.line_num}: not a row of it ({error})."
             ) from None
 
 
-def _value(column: str, cell: str) -> Any:
+def typed(column: str, cell: str) -> Any:
+    """What a cell of a kept file says; NaN where a number is missing."""
     if column in WORDS:
         return cell
     if column in WHOLE:
