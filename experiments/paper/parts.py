@@ -28,6 +28,7 @@ from sumajax.learning import preset
 from sumajax.upsampling import StateUpsampled
 
 PresetName = Literal["fast", "paper"]
+PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 Table1Name = Literal["pp-ic3net", "pp-magic", "pp-hetnet", "pcp-hetnet-2p1c", "pcp-hetnet-3p2c"]
 Selection = Literal[Table1Name, "q1", AblationName]
 TABLE_1: tuple[Selection, ...] = (*get_args(Table1Name), "q1")

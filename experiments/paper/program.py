@@ -43,7 +43,7 @@ from experiments.paper.results import (
     machine,
     recognised,
 )
-from experiments.paper.speed import seconds_per_epoch
+from experiments.paper.speed import PASSES, seconds_per_epoch, wait_until_quiet
 from sumajax import checkpoint
 from sumajax.cli.options import keep_compiled, parse, plain_errors
 from sumajax.cli.transfer import MAX_DEVICES
@@ -91,7 +91,8 @@ class Options:
     import_commit: str = "unknown"
     """The commit that the imported runs are of, which they do not say themselves."""
     measure_speed: bool = False
-    """Train nothing; measure Table II for the chosen experiments, with nothing else running."""
+    """Train nothing; measure Table II for the chosen experiments, with nothing else running: two
+    passes, each row once the machine is quiet."""
     speed_epochs: int = 100
     """Epochs that a row of Table II is measured over."""
 
@@ -320,31 +321,38 @@ def import_runs(options: Options, results: Results) -> None:
 
 
 def measure(options: Options, results: Results) -> None:
-    """Table II for the chosen experiments, a row at a time."""
+    """Table II for the chosen experiments: all its rows, pass after pass."""
+    parts = [p for p in parts_of(options.experiments, options.preset) if p.arm in TABLE_2]
+    for number in range(1, PASSES + 1):
+        for part in parts:
+            measure_part(part, number, options, results)
+
+
+def measure_part(part: Part, number: int, options: Options, results: Results) -> None:
+    """One row in one pass; left out where there is no source to start from."""
     seeds = (SPEED_SEED,)
-    for part in parts_of(options.experiments, options.preset):
-        if part.arm not in TABLE_2:
-            continue
-        start = None
-        if part.source is not None:
-            start = _start(seeds, checkpoints_of(part.source, options, results))
-            if start is None:
-                print(f"{part}: no source to start from, left out")
-                continue
-        experiment = experiment_of(part, options.budget, seeds, start)
-        devices = num_devices(experiment, options)
-        timed = seconds_per_epoch(experiment, options.runs, devices, options.speed_epochs)
-        about = {
-            "experiment": part.experiment,
-            "arm": part.arm.name,
-            "preset": options.preset,
-        }
-        known = machine()
-        where = {"machine": f"{known['processor']}, {known['cores']} cores", "commit": commit()}
-        key = ("experiment", "arm", "preset")
-        results.replace("seconds_per_epoch", [{**about, **timed, **where}], key)
-        results.write()
-        print(f"{part}: {timed['seconds']:.3f} s per epoch", flush=True)
+    start = None
+    if part.source is not None:
+        start = _start(seeds, checkpoints_of(part.source, options, results))
+        if start is None:
+            print(f"{part}: no source to start from, left out")
+            return
+    experiment = experiment_of(part, options.budget, seeds, start)
+    devices = num_devices(experiment, options)
+    if not wait_until_quiet():
+        print(f"{part}: the machine is not quiet; the load is kept beside the row", flush=True)
+    timed = seconds_per_epoch(experiment, options.runs, devices, options.speed_epochs)
+    about = {
+        "experiment": part.experiment,
+        "arm": part.arm.name,
+        "preset": options.preset,
+        "pass": number,
+    }
+    known = machine()
+    where = {"machine": f"{known['processor']}, {known['cores']} cores", "commit": commit()}
+    results.replace("seconds_per_epoch", [{**about, **timed, **where}], tuple(about))
+    results.write()
+    print(f"{part}, pass {number}: {timed['seconds']:.3f} s per epoch", flush=True)
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,14 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
-from experiments.paper.arms import ABLATIONS, SCRATCH, SOURCE, SOURCE_PLAIN, TABLE_2, TRANSFER, Arm
+from experiments.paper.arms import ABLATIONS, SCRATCH, SOURCE, SOURCE_PLAIN, TRANSFER, Arm
 from experiments.paper.claims import NOT_RUN, RULES, Claim, claims, number, said, spread
 from experiments.paper.figures import AXES, figure_2, targets
-from experiments.paper.parts import ABLATED, Budget, Part, PresetName, unchanged_arms
+from experiments.paper.parts import ABLATED, PRESETS, Budget, Part, unchanged_arms
 from experiments.paper.published import EXPERIMENTS, SOURCES
 from experiments.paper.results import Results, write_csv
 from experiments.paper.statistics import (
@@ -31,9 +31,9 @@ from experiments.paper.statistics import (
     ratio_of_medians,
     statistics,
 )
+from experiments.paper.table2 import seconds_here, speed_note, table_2
 from sumajax.reporting import write_text
 
-PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 PROVENANCE = "provenance"
 
 KEPT = """\
@@ -46,12 +46,10 @@ starts, [seconds_per_epoch.csv](seconds_per_epoch.csv) the speed. A test
 
 COSTS = """\
 Three accountings, the source's cost in each: the paper's hours (epochs times its Table II),
-environment steps, and minutes here (epochs times our Table II: one seed alone, one pass, the
-machine not idle, so that two rows of equal work, MAGIC's on the target, differ by 30%; preset
-`paper` has none yet). Steps taken are the mean over the hour before for the first, over ten epochs
-before for the others; times are medians until an epoch's mean is that low. An interval of a ratio
-is Student's on logarithms, given with three seeds or more in both arms while an arm's seeds all
-came to 30 steps or none did."""
+environment steps, and minutes here (epochs times our Table II: one seed alone). Steps taken are the
+mean over the hour before for the first, over ten epochs before for the others; times are medians
+until an epoch's mean is that low. An interval of a ratio is Student's on logarithms, given with
+three seeds or more in both arms while an arm's seeds all came to 30 steps or none did."""
 
 BUDGETS = """\
 Preset `paper`: the paper's pre-training, then until its fixed hour T. Preset `fast`: 1.0 M steps on
@@ -152,24 +150,6 @@ def _failures(compared: Comparison, threshold: float) -> str:
     """Seeds that never came to a threshold within their budget, scratch and transferred."""
     arms = (compared.scratch, compared.transfer)
     return ", ".join(f"{len(a.filled) - a.came_to(threshold)} of {len(a.filled)}" for a in arms)
-
-
-def seconds_here(measured: Iterable[Row]) -> dict[tuple[str, str], dict[str, float]]:
-    """This machine's seconds per epoch, by the arm's name, of each experiment and preset.
-
-    Where two experiments have one source, it was measured once.
-    """
-    measured = list(measured)
-    return {
-        (name, preset): {
-            r["arm"]: r["seconds"]
-            for r in measured
-            if r["preset"] == preset
-            and r["experiment"] == (row.source_of if r["arm"] == SOURCE.name else name)
-        }
-        for name, row in EXPERIMENTS.items()
-        for preset in PRESETS
-    }
 
 
 def costs(results: Results) -> list[dict[str, str]]:
@@ -273,37 +253,6 @@ def on_the_way(curves: Iterable[Row]) -> list[dict[str, str]]:
                     }
                 )
     return rows
-
-
-def table_2(measured: Iterable[Row]) -> list[dict[str, str]]:
-    """Table II: seconds per epoch, the paper's beside ours."""
-    ours = {(row["experiment"], row["arm"], row["preset"]): row for row in measured}
-    rows = []
-    for name, row in EXPERIMENTS.items():
-        for arm in TABLE_2:
-            if arm.task == "source" and name not in SOURCES:
-                continue
-            paper = row.seconds[arm.like]
-            cells = {
-                preset: _seconds(ours.get((name, arm.name, preset)), paper.mean)
-                for preset in PRESETS
-            }
-            rows.append(
-                {
-                    "experiment": row.title if arm.task == "target" else row.source_title,
-                    "arm": arm.name,
-                    "paper (s)": f"{paper.mean:.2f} ± {paper.error:.2f}",
-                    **{f"ours, {preset} (s)": cell for preset, cell in cells.items()},
-                }
-            )
-    return rows
-
-
-def _seconds(row: Row | None, paper: float) -> str:
-    if row is None:
-        return NOT_RUN
-    ours = f"{row['seconds']:.3f} ± {row['standard_error']:.3f}"
-    return f"{ours} ({paper / row['seconds']:.0f}x as fast)"
 
 
 def statistics_rows(results: Results) -> list[Row]:
@@ -432,7 +381,7 @@ def report(results: Results) -> str:
         markdown(times(results)),
         "## Table II: seconds per epoch of 20,000 environment steps",
         markdown(table_2(results.rows["seconds_per_epoch"])),
-        _speed_note(results.rows["seconds_per_epoch"]),
+        speed_note(results.rows["seconds_per_epoch"]),
         "## Figure 2",
         "On the paper's axis, its hours, and by environment steps. Lines are means over the seeds, "
         "bands from the least to the greatest; a transferred policy starts at the cost of its "
@@ -472,19 +421,6 @@ def _line(claim: Claim) -> dict[str, str]:
         "verdict": f"**{claim.verdict}**" if claim.verdict != NOT_RUN else claim.verdict,
         "reason": claim.reason,
     }
-
-
-def _speed_note(measured: Iterable[Row]) -> str:
-    rows = list(measured)
-    if not rows:
-        return "Ours has not been measured yet (`--measure-speed`)."
-    machines = sorted({row["machine"] for row in rows})
-    load = max(row["load_before"] for row in rows)
-    least = min(row["epochs"] for row in rows)
-    return (
-        f"Ours: one seed, mean and standard error over {least} epochs or more on "
-        f"{'; '.join(machines)}; the highest load before a row was {load:.2f}."
-    )
 
 
 def _budgets(results: Results, known: Iterable[str]) -> str:

@@ -43,6 +43,7 @@ COLUMNS = {
         "experiment",
         "arm",
         "preset",
+        "pass",
         "epochs",
         "seconds",
         "standard_error",
@@ -55,7 +56,7 @@ COLUMNS = {
 `seeds_at_once` seeds training side by side; `env_steps` and `seconds` count the arm alone."""
 
 WHOLE = {
-    *("seed", "epoch", "env_steps", "seeds_at_once", "episodes", "epochs"),
+    *("seed", "epoch", "env_steps", "seeds_at_once", "episodes", "epochs", "pass"),
     *("max_steps", "side", "limit"),
 }
 WORDS = {
@@ -378,5 +379,6 @@ def _order(row: Row) -> tuple[Any, ...]:
         row.get("arm", row.get("task")),
         row.get("seed", 0),
         row.get("epoch", 0),
+        row.get("pass", 0),
         row.get("mode", ""),
     )

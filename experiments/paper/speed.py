@@ -13,6 +13,25 @@ from sumajax.experiment import Experiment
 from sumajax.experiment.run import Run, Where
 from sumajax.learning import parallel
 
+PASSES = 2
+"""Times that every row is measured, each time after all the others: what a machine does in another
+hour shows between passes, not within one."""
+QUIET_LOAD = 0.5
+"""Mean number of running processes over a minute (`os.getloadavg`) under which a row begins."""
+PATIENCE_SECONDS = 600.0
+"""Longest wait for that; the row before it is over after two minutes."""
+_LOOK_SECONDS = 5.0
+
+
+def wait_until_quiet() -> bool:
+    """Waits for a load under `QUIET_LOAD`; False when it did not come."""
+    until = time.monotonic() + PATIENCE_SECONDS
+    while os.getloadavg()[0] >= QUIET_LOAD:
+        if time.monotonic() > until:
+            return False
+        time.sleep(_LOOK_SECONDS)
+    return True
+
 
 def seconds_per_epoch(
     experiment: Experiment, directory: Path, devices: int, epochs: int

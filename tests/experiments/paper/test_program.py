@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.paper import parts, program
+from experiments.paper import parts, program, speed
 from experiments.paper.arms import SOURCE, TRANSFER
 from experiments.paper.parts import Budget, Part
 from experiments.paper.program import Provenance, run
 from experiments.paper.results import Results
-from experiments.paper.speed import seconds_per_epoch
+from experiments.paper.speed import PASSES, QUIET_LOAD, seconds_per_epoch, wait_until_quiet
 from sumajax import checkpoint, reporting
 from sumajax.reporting import append_rows, rows_of
 from sumajax.transfer import StoppedError
@@ -170,6 +170,7 @@ def test_speed_is_measured_from_a_source_that_holds_its_seed(tiny, tmp_path, mon
         return {"epochs": epochs, "seconds": 1.0, "standard_error": 0.1, "load_before": 0.0}
 
     monkeypatch.setattr(program, "seconds_per_epoch", timed)
+    monkeypatch.setattr(program, "wait_until_quiet", lambda: True)
     program.measure(replace(tiny, measure_speed=True), Results.read(tiny.output))
     assert seen == {"source": ((0,), None), "transfer": ((0,), ours), "scratch": ((0,), None)}
 
@@ -183,8 +184,43 @@ def test_only_the_papers_own_arms_are_measured(tiny, monkeypatch):
         "seconds_per_epoch",
         lambda experiment, *_: seen.append(experiment.name) or timed,
     )
+    monkeypatch.setattr(program, "wait_until_quiet", lambda: True)
     program.measure(replace(tiny, experiments=("mass",)), Results.read(tiny.output))
-    assert seen == ["pp-ic3net source", "pp-ic3net scratch"]
+    assert seen == ["pp-ic3net source", "pp-ic3net scratch"] * PASSES
+
+
+def test_every_pass_is_kept_and_an_unquiet_machine_told_of(tiny, monkeypatch, capsys):
+    monkeypatch.setattr(program, "wait_until_quiet", lambda: False)
+    timed = {"epochs": 1, "seconds": 1.0, "standard_error": 0.1, "load_before": 3.0}
+    monkeypatch.setattr(program, "seconds_per_epoch", lambda *_: timed)
+    program.measure(replace(tiny, experiments=("pp-ic3net",)), Results.read(tiny.output))
+    rows = Results.read(tiny.output).rows["seconds_per_epoch"]
+    found = [(row["arm"], row["pass"], row["load_before"]) for row in rows]
+    assert found == [
+        ("scratch", 1, 3.0),
+        ("scratch", 2, 3.0),
+        ("source", 1, 3.0),
+        ("source", 2, 3.0),
+    ]
+    assert "pp-ic3net scratch: the machine is not quiet" in capsys.readouterr().out
+
+
+def test_a_row_waits_until_the_machine_is_quiet(monkeypatch):
+    loads = [(2.0,), (QUIET_LOAD,), (QUIET_LOAD / 2,)]
+    slept = []
+    monkeypatch.setattr(speed.os, "getloadavg", lambda: loads[min(len(slept), len(loads) - 1)])
+    monkeypatch.setattr(speed.time, "sleep", slept.append)
+    assert wait_until_quiet()
+    assert len(slept) == 2
+
+
+def test_but_not_for_ever(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(speed.os, "getloadavg", lambda: (2.0,))
+    monkeypatch.setattr(speed.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(speed.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    assert not wait_until_quiet()
+    assert now[0] >= speed.PATIENCE_SECONDS
 
 
 @pytest.mark.slow

@@ -12,12 +12,11 @@ from experiments.paper.report import (
     costs,
     on_the_way,
     report,
-    seconds_here,
     table_1,
-    table_2,
     times,
 )
 from experiments.paper.results import KEY, Results
+from experiments.paper.table2 import table_2
 
 from .rows import RESULTS, arms
 
@@ -45,7 +44,7 @@ def kept(tmp_path):
         ("experiment", "task"),
     )
     timed = {"epochs": 100, "seconds": 0.5, "standard_error": 0.01, "load_before": 0.0}
-    about = {"experiment": "pp-ic3net", "arm": "scratch", "preset": "fast"}
+    about = {"experiment": "pp-ic3net", "arm": "scratch", "preset": "fast", "pass": 1}
     where = {"machine": "two cores", "commit": "abc"}
     results.replace("seconds_per_epoch", [{**about, **timed, **where}], ("experiment", "arm"))
     results.write()
@@ -102,16 +101,6 @@ def test_every_comparison_stands_under_each_accounting(kept):
     assert at_30["target alone, M environment steps"].startswith("never (never-never) -> 0.0400")
     assert at_20["never: scratch, transfer"] == "3 of 3, 1 of 3"
     assert "not measured" not in at_20.values()
-
-
-def test_a_source_of_two_experiments_is_measured_once():
-    timed = [
-        {"experiment": "pcp-hetnet-2p1c", "arm": "source", "preset": "fast", "seconds": 1.0},
-        {"experiment": "pcp-hetnet-3p2c", "arm": "scratch", "preset": "fast", "seconds": 2.0},
-    ]
-    found = seconds_here(timed)
-    assert found["pcp-hetnet-3p2c", "fast"] == {"source": 1.0, "scratch": 2.0}
-    assert found["pcp-hetnet-2p1c", "fast"] == {"source": 1.0}
 
 
 def test_the_kept_results_are_what_their_files_say(tmp_path, monkeypatch):
