@@ -211,27 +211,29 @@ def test_a_second_run_in_the_same_directory_is_refused(tmp_path):
         run_experiment(TOY, busy)
 
 
+LONG = PredatorPrey(size=(6, 12), num_predators=4, max_steps=30)
+CHAIN = (
+    Stage("3x3-2", StateUpsampled(SMALL, (6, 12)), 1, learner=LEARNER),
+    Stage("6x6-3", StateUpsampled(LARGE, (6, 12)), 2, start="3x3-2", learner=LEARNER),
+    Stage("6x12-4", LONG, 1, start="6x6-3", learner=LEARNER),
+    Stage("scratch", LONG, 3, learner=LEARNER),
+)
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("chain") / "r"
+    experiment = replace(TOY, stages=CHAIN, seeds=(0,), evaluate_every=0)
+    with stopped_in("6x6-3", Stopped):
+        run_experiment(experiment, directory, Where(chunk=1))
+    return directory, run_experiment(experiment, directory, Where(chunk=1))
+
+
 class TestChain:
     """Three stages: other teams, sides and step limits, and a rival with a budget of its own."""
 
-    LONG = PredatorPrey(size=(6, 12), num_predators=4, max_steps=30)
-    STAGES = (
-        Stage("3x3-2", StateUpsampled(SMALL, (6, 12)), 1, learner=LEARNER),
-        Stage("6x6-3", StateUpsampled(LARGE, (6, 12)), 2, start="3x3-2", learner=LEARNER),
-        Stage("6x12-4", LONG, 1, start="6x6-3", learner=LEARNER),
-        Stage("scratch", LONG, 3, learner=LEARNER),
-    )
-
-    @pytest.fixture(scope="class")
-    def run(self, tmp_path_factory):
-        directory = tmp_path_factory.mktemp("chain") / "r"
-        experiment = replace(TOY, stages=self.STAGES, seeds=(0,), evaluate_every=0)
-        with stopped_in("6x6-3", Stopped):
-            run_experiment(experiment, directory, Where(chunk=1))
-        return directory, run_experiment(experiment, directory, Where(chunk=1))
-
-    def test_summary_has_every_stage_and_what_it_cost(self, run):
-        directory, summary = run
+    def test_summary_has_every_stage_and_what_it_cost(self, chain):
+        directory, summary = chain
         assert json.loads((directory / "summary.json").read_text()) == summary
         assert [stage["name"] for stage in summary["stages"]] == ["3x3-2", "6x6-3", "6x12-4"]
         assert [stage["zero_shot"] is None for stage in summary["stages"]] == [True, False, False]
@@ -247,14 +249,14 @@ class TestChain:
             key: summary["stages"][2][key] for key in summary["transfer"]
         }
 
-    def test_rows_are_named_after_the_stages(self, run):
-        arms = dict.fromkeys(row["arm"] for row in rows(run[0]))
+    def test_rows_are_named_after_the_stages(self, chain):
+        arms = dict.fromkeys(row["arm"] for row in rows(chain[0]))
         assert list(arms) == ["3x3-2", "6x6-3", "6x12-4", "scratch"]
 
-    def test_the_last_stage_is_the_policy_of_the_run(self, run):
-        assert load_agent(run[0]).env == self.LONG
-        first = load_agent(run[0] / "checkpoints" / "3x3-2")
-        assert first.env == self.STAGES[0].env
+    def test_the_last_stage_is_the_policy_of_the_run(self, chain):
+        assert load_agent(chain[0]).env == LONG
+        first = load_agent(chain[0] / "checkpoints" / "3x3-2")
+        assert first.env == CHAIN[0].env
 
 
 def test_its_results_in_the_form_of_marl_eval(finished):
