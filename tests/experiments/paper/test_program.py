@@ -157,10 +157,9 @@ def test_checkpoints_are_found_in_imported_runs(tiny, tmp_path, monkeypatch):
     assert found == [((0,), source)]
 
 
-def test_speed_is_measured_from_a_source_that_holds_its_seed(tiny, tmp_path, monkeypatch):
-    """Not from the first that is found, which may be of other seeds."""
-    others, ours = (tmp_path / name / "checkpoints" / "source" for name in ("others", "ours"))
-    sources = [((3, 4), others), ((0, 1, 2), ours)]
+def test_speed_is_measured_from_a_source_with_a_seed_that_it_holds(tiny, tmp_path, monkeypatch):
+    ours = tmp_path / "ours" / "checkpoints" / "source"
+    sources = [((3, 4), ours), ((0, 1, 2), tmp_path / "others")]
     monkeypatch.setattr(program, "checkpoints_of", lambda *_: sources)
     seen = {}
 
@@ -172,7 +171,7 @@ def test_speed_is_measured_from_a_source_that_holds_its_seed(tiny, tmp_path, mon
     monkeypatch.setattr(program, "seconds_per_epoch", timed)
     monkeypatch.setattr(program, "wait_until_quiet", lambda: True)
     program.measure(replace(tiny, measure_speed=True), Results.read(tiny.output))
-    assert seen == {"source": ((0,), None), "transfer": ((0,), ours), "scratch": ((0,), None)}
+    assert seen == {"source": ((0,), None), "transfer": ((3,), ours), "scratch": ((0,), None)}
 
 
 def test_only_the_papers_own_arms_are_measured(tiny, monkeypatch):
