@@ -445,7 +445,8 @@ def _budgets(results: Results, known: Iterable[str]) -> str:
 
 def _kept(preset: str, last: Mapping[int, int]) -> str:
     epochs = sorted(set(last.values()))
-    return f"{preset}: {len(last)} seeds, {' or '.join(map(str, epochs))} epochs"
+    seeds = "1 seed" if len(last) == 1 else f"{len(last)} seeds"
+    return f"{preset}: {seeds}, {' or '.join(map(str, epochs))} epochs"
 
 
 def _configurations(directory: Path) -> str:
