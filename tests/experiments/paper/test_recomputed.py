@@ -553,6 +553,13 @@ def by_procedure(name, between):
     return between.join(f"{arm.mean():.1f}" for arm in arms)
 
 
+def test_the_words_of_the_page_of_verdicts():
+    _, scratch, transfer = at_the_hour("pp-hetnet", "paper")
+    apart = np.divide.outer(scratch, transfer)
+    page = plain((ROOT / "docs" / "verdicts.md").read_text())
+    assert f"all pairs of seeds are {apart.min():.1f} to {apart.max():.1f} times apart" in page
+
+
 def sentences_of_the_ablations():
     def way(name, words):
         return f"{steps_taken(name, ablated(name, words)[0]).mean():.1f}"
