@@ -18,6 +18,7 @@ from trajectories import TINY_TASK, tiny_learner
 from sumajax.learning import parallel
 
 SEEDS = [0, 5]
+PIECES = Path("/proc/self/maps")
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 events = []
@@ -85,6 +86,25 @@ def test_a_stage_like_an_earlier_one_is_traced_no_second_time():
         before = programs_compiled()
         parallel.compile_train(learner, mesh, 1, states)
         assert programs_compiled() - before == compiled
+
+
+@pytest.mark.skipif(not PIECES.exists(), reason="counts the pieces of memory that Linux lists")
+def test_a_program_that_is_forgotten_gives_its_memory_back():
+    def pieces():
+        return len(PIECES.read_text().splitlines())
+
+    def compile_one():
+        learner = tiny_learner(TINY_TASK, num_envs=200, rollout_length=20)
+        states = jax.eval_shape(partial(begun_seeds, learner, [0]))
+        parallel.compile_train(learner, parallel.make_mesh(1, 200, devices=1), 1, states)
+
+    parallel.forget_programs()
+    before = pieces()
+    compile_one()
+    kept = pieces() - before
+    parallel.forget_programs()
+    assert kept > 100
+    assert pieces() - before < kept / 4
 
 
 def test_seeds_side_by_side_share_every_product():
