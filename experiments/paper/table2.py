@@ -103,13 +103,16 @@ def _sitting(preset: str, rows: Sequence[Row]) -> str:
     load = max(row["load_before"] for row in rows)
     least = min(row["epochs"] for row in rows)
     about = f"Preset `{preset}`: {least} epochs or more, the highest load before a row {load:.2f}"
-    twice = [passes for passes in by_pass(rows).values() if len(passes) > 1]
+    measured = by_pass(rows).values()
+    twice = [passes for passes in measured if len(passes) > 1]
     if not twice:
         return f"{about}, one pass."
+    once = len(measured) - len(twice)
+    rest = f"; {once} of {len(measured)} rows have one pass" if once else ""
     worst = max(
         max(r["seconds"] for r in passes) / min(r["seconds"] for r in passes) for passes in twice
     )
     return (
         f"{about}; the passes of {sum(map(_agree, twice))} of {len(twice)} rows agree within two "
-        f"standard errors, the furthest differ by {100 * (worst - 1):.0f}%."
+        f"standard errors, the furthest differ by {100 * (worst - 1):.0f}%{rest}."
     )

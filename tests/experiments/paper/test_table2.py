@@ -47,9 +47,11 @@ def test_whether_passes_agree_is_said_for_each_preset():
     ]
     note = speed_note(rows)
     assert "highest load before a row 0.49; the passes of 1 of 2 rows agree" in note
-    assert "the furthest differ by 20%" in note
+    assert "the furthest differ by 20%. " in note
     assert note.endswith(
         "Preset `paper`: 100 epochs or more, the highest load before a row 0.25, one pass."
     )
+    stopped = speed_note([*rows, *measured("source-plain", 1.0)])
+    assert "the furthest differ by 20%; 1 of 3 rows have one pass." in stopped
     assert "Preset `paper` has not been measured yet" in speed_note(measured("scratch", 0.5))
     assert "has not been measured yet" in speed_note([])
