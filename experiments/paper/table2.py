@@ -108,7 +108,7 @@ def _sitting(preset: str, rows: Sequence[Row]) -> str:
     if not twice:
         return f"{about}, one pass."
     once = len(measured) - len(twice)
-    rest = f"; {once} of {len(measured)} rows have one pass" if once else ""
+    rest = f"; {once} of {len(measured)} have one pass alone" if once else ""
     worst = max(
         max(r["seconds"] for r in passes) / min(r["seconds"] for r in passes) for passes in twice
     )

@@ -52,6 +52,6 @@ def test_whether_passes_agree_is_said_for_each_preset():
         "Preset `paper`: 100 epochs or more, the highest load before a row 0.25, one pass."
     )
     stopped = speed_note([*rows, *measured("source-plain", 1.0)])
-    assert "the furthest differ by 20%; 1 of 3 rows have one pass." in stopped
+    assert "the furthest differ by 20%; 1 of 3 have one pass alone." in stopped
     assert "Preset `paper` has not been measured yet" in speed_note(measured("scratch", 0.5))
     assert "has not been measured yet" in speed_note([])
