@@ -22,7 +22,6 @@ from experiments.paper.results import Row, commit, machine, typed
 from sumajax.description import versions
 from sumajax.experiment import Experiment, run_experiment
 from sumajax.experiment.run import Run, Where
-from sumajax.learning import parallel
 from sumajax.reporting import metrics, write_json
 
 PROVENANCE = "provenance"
@@ -67,10 +66,7 @@ class StudyRun(Generic[S]):
     def train(self) -> None:
         """What is still missing of it."""
         if not self.has_ended:
-            try:
-                run_experiment(self.experiment, self.directory, Where(devices=self.devices))
-            finally:
-                parallel.forget_programs()
+            run_experiment(self.experiment, self.directory, Where(devices=self.devices))
 
 
 def begun(study: Study, runs: Path) -> list[tuple[int, ...]]:

@@ -53,8 +53,6 @@ tests; with JAX 0.12, whose programs have more, workers died while a program was
 def room_for_programs():
     """What earlier files compiled is forgotten in time."""
     yield
-    pieces = Path("/proc/self/maps")
-    if pieces.exists() and len(pieces.read_text().splitlines()) > MOST_PIECES:
-        from sumajax.learning import parallel  # after JAX's flags
+    from sumajax.learning import parallel  # after JAX's flags
 
-        parallel.forget_programs()
+    parallel.make_room(MOST_PIECES)

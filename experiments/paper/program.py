@@ -294,8 +294,6 @@ def train_part(
             note.write(results.directory, {"stopped": str(error)})
             print(f"{part}: {error}", flush=True)
             return
-        finally:
-            parallel.forget_programs()
     note.keep_plan(results.directory, finished.plan)
     results.add(finished)
     results.write()
@@ -358,7 +356,6 @@ def measure_part(part: Part, number: int, options: Options, results: Results) ->
     results.replace("seconds_per_epoch", [{**about, **timed, **where}], tuple(about))
     results.write()
     print(f"{part}, pass {number}: {timed['seconds']:.3f} s per epoch", flush=True)
-    parallel.forget_programs()
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,11 @@ Train = Callable[[TrainState], tuple[TrainState, Metrics]]
 PROGRAMS_KEPT = 32
 """Of each kind in a process: a stage that goes on, or one like another, traces nothing again."""
 
+MOST_PIECES = 40_000
+"""Of memory, that may be mapped when a stage is compiled. Linux allows a process 65,530
+(`vm.max_map_count`) and a compiled stage has some 5,000, its evaluations counted."""
+_PIECES = Path("/proc/self/maps")  # one per line, on Linux
+
 
 @dataclass(frozen=True)
 class Execution:
@@ -287,19 +292,19 @@ def compile_train(
     execution: Execution | None = None,
     compiler_options: dict[str, Any] | None = None,
 ) -> Train:
-    """`make_train` compiled ahead for `states`, so that its cost can be told apart."""
+    """`make_train` compiled ahead for `states`, so that its cost can be told apart.
+
+    Makes room for it first: a process may go through any number of stages.
+    """
+    make_room(MOST_PIECES)
     lowered = make_train(learner, mesh, epochs, execution).lower(states)  # type: ignore[attr-defined]
     return lowered.compile(compiler_options)
 
 
-def forget_programs() -> None:
-    """Frees what this process has compiled and nobody holds any more.
-
-    Of a training program JAX keeps 2,000 to 4,000 mapped pieces of memory, and Linux allows a
-    process 65,530 (`vm.max_map_count`): one that goes through many plans dies within LLVM unless
-    it forgets between them.
-    """
-    jax.clear_caches()
+def make_room(most: int) -> None:
+    """Frees what was compiled and nobody holds any more, if over `most` pieces are mapped."""
+    if _PIECES.exists() and len(_PIECES.read_text().splitlines()) > most:
+        jax.clear_caches()
 
 
 def state_specs() -> Any:

@@ -5,10 +5,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from experiments import studies
 from experiments.studies import curves_of, read_csv, replaced, study_runs
 from sumajax.reporting import metrics
-from sumajax.transfer import StoppedError
 
 
 @dataclass(frozen=True)
@@ -30,24 +28,6 @@ def test_seeds_that_are_added_have_a_run_of_their_own(tmp_path):
     assert groups(0, 1) == [(0, 1)]
     assert groups(1, 2, 3) == [(0, 1), (2, 3)]
     assert groups(4) == [(4,)]
-
-
-def test_a_run_that_ended_or_stopped_leaves_no_programs_behind(tmp_path, monkeypatch):
-    done = []
-
-    def run_experiment(*_):
-        done.append("run")
-        if len(done) > 2:
-            raise StoppedError("every seed")
-
-    monkeypatch.setattr(Toy, "experiment", lambda *_: None)
-    monkeypatch.setattr(studies, "run_experiment", run_experiment)
-    monkeypatch.setattr(studies.parallel, "forget_programs", lambda: done.append("forgotten"))
-    (run,) = study_runs(Toy(), (0,), tmp_path, 1)
-    run.train()
-    with pytest.raises(StoppedError):
-        run.train()
-    assert done == ["run", "forgotten"] * 2
 
 
 def test_rows_are_read_with_their_types(tmp_path):

@@ -89,22 +89,23 @@ def test_a_stage_like_an_earlier_one_is_traced_no_second_time():
 
 
 @pytest.mark.skipif(not PIECES.exists(), reason="counts the pieces of memory that Linux lists")
-def test_a_program_that_is_forgotten_gives_its_memory_back():
-    def pieces():
-        return len(PIECES.read_text().splitlines())
+def test_a_process_may_go_through_any_number_of_stages(monkeypatch):
+    """The programs of earlier ones are let go before they fill what Linux lets a process map."""
 
-    def compile_one():
-        learner = tiny_learner(TINY_TASK, num_envs=200, rollout_length=20)
+    def pieces_after_stage(max_steps):
+        task = replace(TINY_TASK, max_steps=max_steps)
+        learner = tiny_learner(task, num_envs=200, rollout_length=20)
         states = jax.eval_shape(partial(begun_seeds, learner, [0]))
         parallel.compile_train(learner, parallel.make_mesh(1, 200, devices=1), 1, states)
+        return len(PIECES.read_text().splitlines())
 
-    parallel.forget_programs()
-    before = pieces()
-    compile_one()
-    kept = pieces() - before
-    parallel.forget_programs()
-    assert kept > 100
-    assert pieces() - before < kept / 4
+    parallel.make_room(0)
+    first, *others = [pieces_after_stage(n) for n in (7, 8, 9)]
+    each = others[0] - first
+    assert each > 100
+    assert others[1] > first + 1.5 * each
+    monkeypatch.setattr(parallel, "MOST_PIECES", first)
+    assert max(pieces_after_stage(n) for n in (10, 11, 12)) < first + each / 2
 
 
 def test_seeds_side_by_side_share_every_product():

@@ -32,15 +32,7 @@ def pretend(experiment, directory, where):
     (directory / "summary.json").write_text("{}")
 
 
-@pytest.fixture
-def forgotten(monkeypatch):
-    """One per time that compiled programs were forgotten."""
-    times = []
-    monkeypatch.setattr(program.parallel, "forget_programs", lambda: times.append(None))
-    return times
-
-
-def test_only_what_is_missing_is_run(tiny, monkeypatch, forgotten):
+def test_only_what_is_missing_is_run(tiny, monkeypatch):
     ran = []
     monkeypatch.setattr(parts, "ABLATED", ("pp-ic3net",))
 
@@ -56,7 +48,6 @@ def test_only_what_is_missing_is_run(tiny, monkeypatch, forgotten):
         run(tiny)
     run(tiny)
     assert ran == ["source/seeds-0", *["transfer/seeds-0"] * 2, "scratch/seeds-0"]
-    assert len(forgotten) == len(ran)
     for file in (tiny.output / "provenance").glob("*.json"):
         assert json.loads(file.read_text())["experiment"] == {"seeds": [0], "preset": "fast"}
     run(replace(tiny, seeds=(0, 1, 2)))
@@ -197,7 +188,7 @@ def test_only_the_papers_own_arms_are_measured(tiny, monkeypatch):
     assert seen == ["pp-ic3net source", "pp-ic3net scratch"] * PASSES
 
 
-def test_every_pass_is_kept_and_an_unquiet_machine_told_of(tiny, monkeypatch, capsys, forgotten):
+def test_every_pass_is_kept_and_an_unquiet_machine_told_of(tiny, monkeypatch, capsys):
     monkeypatch.setattr(program, "wait_until_quiet", lambda: False)
     timed = {"epochs": 1, "seconds": 1.0, "standard_error": 0.1, "load_before": 3.0}
     monkeypatch.setattr(program, "seconds_per_epoch", lambda *_: timed)
@@ -210,7 +201,6 @@ def test_every_pass_is_kept_and_an_unquiet_machine_told_of(tiny, monkeypatch, ca
         ("source", 1, 3.0),
         ("source", 2, 3.0),
     ]
-    assert len(forgotten) == len(found)
     assert "pp-ic3net scratch: the machine is not quiet" in capsys.readouterr().out
 
 
