@@ -104,8 +104,8 @@ def test_a_process_may_go_through_any_number_of_stages(monkeypatch):
     each = others[0] - first
     assert each > 100
     assert others[1] > first + 1.5 * each
-    monkeypatch.setattr(parallel, "MOST_PIECES", first)
-    assert max(pieces_after_stage(n) for n in (10, 11, 12)) < first + each / 2
+    monkeypatch.setattr(parallel, "MOST_PIECES", first + each)
+    assert max(pieces_after_stage(n) for n in range(10, 15)) < first + 2.5 * each
 
 
 def test_seeds_side_by_side_share_every_product():
