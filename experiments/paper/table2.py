@@ -102,7 +102,7 @@ def _sitting(preset: str, rows: Sequence[Row]) -> str:
         return f"Preset `{preset}` has not been measured yet."
     load = max(row["load_before"] for row in rows)
     least = min(row["epochs"] for row in rows)
-    about = f"Preset `{preset}`: {least} epochs or more, the highest load before a row {load:.2f}"
+    about = f"Preset `{preset}`: {least} epochs or more, the highest load before a row {load:.3f}"
     measured = by_pass(rows).values()
     twice = [passes for passes in measured if len(passes) > 1]
     if not twice:

@@ -42,14 +42,14 @@ def test_the_error_is_the_larger_of_within_and_between_passes(seconds, cell):
 def test_whether_passes_agree_is_said_for_each_preset():
     rows = [
         *measured("scratch", 0.500, 0.525),
-        *measured("transfer", 0.500, 0.600, load=0.49),
+        *measured("transfer", 0.500, 0.600, load=0.499),
         *measured("source", 1.0, preset="paper"),
     ]
     note = speed_note(rows)
-    assert "highest load before a row 0.49; the passes of 1 of 2 rows agree" in note
+    assert "highest load before a row 0.499; the passes of 1 of 2 rows agree" in note
     assert "the furthest differ by 20%. " in note
     assert note.endswith(
-        "Preset `paper`: 100 epochs or more, the highest load before a row 0.25, one pass."
+        "Preset `paper`: 100 epochs or more, the highest load before a row 0.250, one pass."
     )
     stopped = speed_note([*rows, *measured("source-plain", 1.0)])
     assert "the furthest differ by 20%; 1 of 3 have one pass alone." in stopped
