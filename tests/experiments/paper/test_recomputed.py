@@ -542,7 +542,8 @@ def sentences_of_the_readme():
         "initial weights none of three does, and transferred all do",
         f"({', '.join(tasks)}: success {', '.join(driven)}, three seeds",
         f"HetNet takes {by_procedure('pp-hetnet', ' steps from scratch and ')} transferred (the "
-        f"paper: 189.7, 27.1), IC3Net {by_procedure('pp-ic3net', ' and ')}: there transfer hurts",
+        f"paper: 189.7, 27.1), with 3 + 2 agents {by_procedure('pcp-hetnet-3p2c', ' and ')} "
+        f"(199.9, 25.3), IC3Net {by_procedure('pp-ic3net', ' and ')}: there transfer hurts",
     ]
 
 
@@ -554,10 +555,27 @@ def by_procedure(name, between):
 
 
 def test_the_words_of_the_page_of_verdicts():
-    _, scratch, transfer = at_the_hour("pp-hetnet", "paper")
-    apart = np.divide.outer(scratch, transfer)
     page = plain((ROOT / "docs" / "verdicts.md").read_text())
-    assert f"all pairs of seeds are {apart.min():.1f} to {apart.max():.1f} times apart" in page
+    for name, words in (
+        ("pp-hetnet", "at the paper's hour all pairs of seeds are {} to {} times apart"),
+        ("pcp-hetnet-3p2c", "Predator-Capture-Prey with 3 + 2 agents holds in part too, {} to {}"),
+    ):
+        _, scratch, transfer = at_the_hour(name, "paper")
+        apart = np.divide.outer(scratch, transfer)
+        assert words.format(f"{apart.min():.1f}", f"{apart.max():.1f}") in page
+    assert f"({transfer.mean():.1f} and 25.3 steps)" in page
+    assert f"comes to {min(scratch):.0f} to {max(scratch):.0f} steps here" in page
+    about = ("paper", "pcp-hetnet-3p2c", "scratch/transfer")
+    (interval,) = (
+        row
+        for row in read("statistics")
+        if (row["preset"], row["experiment"], row["of"]) == about
+        and row["quantity"].endswith("source in: the paper's hours")
+        and row["at"] == "350"
+        and "at equal cost" in row["quantity"]
+    )
+    low, high = float(interval["low"]), float(interval["high"])
+    assert f"interval, {low:.2f} to {high:.0f}, tells nothing" in page
 
 
 def sentences_of_the_ablations():
