@@ -312,18 +312,22 @@ class Relay(ConstantReward):
 
 
 def test_a_learner_values_what_an_agent_earns_itself():
-    """What its successor earns is not its own."""
-    small = {"num_envs": 25, "rollout_length": 4, "learning_rate": 1e-2, "gamma": 0.5}
+    """What its successor earns is not its own.
+
+    Half as wide a critic, at twice the rate for half as long, mixes the two up in one seed of ten.
+    """
+    small = {"num_envs": 25, "rollout_length": 4, "learning_rate": 5e-3, "gamma": 0.5}
     (trajectory,) = learn(
         Relay(),
         policy="tarmac-ic3net",
-        updates=600,
+        updates=1_200,
+        hidden=16,
         seeds=2,
         team_reward=0.0,
         alive_mask="after",
         **small,
     )
-    np.testing.assert_allclose(values_by_step(trajectory, Relay()), [[1, 1.5, 1]] * 2, atol=0.1)
+    np.testing.assert_allclose(values_by_step(trajectory, Relay()), [[1, 1.5, 1]] * 2, atol=0.05)
 
 
 def test_a_loss_that_knows_no_leaving_is_refused():

@@ -110,7 +110,8 @@ def test_loss_and_its_gradient(config):
         products = jax.tree.map(lambda g, d: (g * d).sum(), gradients, direction)
         along = sum(jax.tree.leaves(products))
         np.testing.assert_allclose(along, (ahead - behind) / (2 * step), rtol=1e-5)
-    assert parts.acting == (valid[..., None] & (trajectory.active | ~config.mask_inactive)).sum()
+    acting = trajectory.active | (not config.mask_inactive)
+    assert parts.acting == (valid[..., None] & acting).sum()
 
 
 def test_a_step_limit_is_no_end():
