@@ -86,10 +86,9 @@ def speed_note(measured: Iterable[Row]) -> str:
     rows = list(measured)
     if not rows:
         return "Ours has not been measured yet (`--measure-speed`)."
-    machines = sorted({row["machine"] for row in rows})
     return (
-        f"Ours: one seed alone, on {'; '.join(machines)}; the standard error within a pass over "
-        "the rows, or half the difference between passes where it is larger. "
+        "Ours: one seed alone; the standard error within a pass over the rows, or half the "
+        "difference between passes where it is larger. "
         + " ".join(
             _sitting(preset, [r for r in rows if r["preset"] == preset]) for preset in PRESETS
         )
@@ -97,12 +96,16 @@ def speed_note(measured: Iterable[Row]) -> str:
 
 
 def _sitting(preset: str, rows: Sequence[Row]) -> str:
-    """How the rows of a preset were measured, and whether their passes agree."""
+    """Where and how the rows of a preset were measured, and whether their passes agree."""
     if not rows:
         return f"Preset `{preset}` has not been measured yet."
     load = max(row["load_before"] for row in rows)
     least = min(row["epochs"] for row in rows)
-    about = f"Preset `{preset}`: {least} epochs or more, the highest load before a row {load:.3f}"
+    machines = "; ".join(sorted({row["machine"] for row in rows}))
+    about = (
+        f"Preset `{preset}`, on {machines}: {least} epochs or more, the highest load before a row "
+        f"{load:.3f}"
+    )
     measured = by_pass(rows).values()
     twice = [passes for passes in measured if len(passes) > 1]
     if not twice:

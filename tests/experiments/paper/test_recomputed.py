@@ -92,10 +92,7 @@ def epochs_to(name, arm, threshold=20, preset="fast"):
 
 def costs(name, threshold=20):
     """(scratch, transferred with its source) by accounting, of every seed, under preset `fast`."""
-    passes = defaultdict(list)
-    for row in timed():
-        passes[row["experiment"], row["arm"]].append(float(row["seconds"]))
-    here = {key: np.mean(seconds) for key, seconds in passes.items()}
+    here = {key: np.mean(seconds) for key, seconds in passes().items()}
     source = steps_taken(source_of(name), "source").shape[1]
     scratch, transfer = (
         epochs_to(name, "scratch", threshold),
@@ -112,8 +109,19 @@ def costs(name, threshold=20):
     }
 
 
-def timed():
-    return [row for row in read("seconds_per_epoch") if row["preset"] == "fast"]
+def passes_apart():
+    """By how much the slower of two passes was slower, at most, as a share."""
+    assert {len(seconds) for seconds in passes().values()} == {2}
+    return max(max(seconds) / min(seconds) for seconds in passes().values()) - 1
+
+
+def passes():
+    """Experiment and arm -> seconds an epoch of each pass."""
+    found = defaultdict(list)
+    for row in read("seconds_per_epoch"):
+        if row["preset"] == "fast":
+            found[row["experiment"], row["arm"]].append(float(row["seconds"]))
+    return found
 
 
 def median(times):
@@ -540,7 +548,8 @@ def sentences_of_the_readme():
         f"scratch needs {min(pp):.2f} to {max(pp):.2f} times the environment steps, on "
         f"Predator-Capture-Prey {pcp[0]:.1f} times (ranges overlap)",
         f"Scratch takes {hours[0]:.1f} to {hours[1]:.1f} times the paper's hours",
-        f"{here[0]:.2f} to {here[1]:.1f} times the minutes here",
+        f"{here[0]:.2f} to {here[1]:.1f} times the minutes here (two passes, at most "
+        f"{100 * passes_apart():.0f}% apart)",
         f"{np.sum(came)} of {np.size(came)} such seeds come to 30 steps. With the originals' "
         "initial weights none of three does, and transferred all do",
         f"({', '.join(tasks)}: success {', '.join(driven)}, three seeds",

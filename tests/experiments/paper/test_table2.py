@@ -6,8 +6,8 @@ from experiments.paper.table2 import seconds_here, speed_note, table_2
 
 
 def measured(arm, *seconds, experiment="pp-hetnet", preset="fast", error=0.01, load=0.25):
-    """A pass per number."""
-    about = {"experiment": experiment, "arm": arm, "preset": preset, "machine": "two cores"}
+    """A pass per number; each preset on a machine of its own."""
+    about = {"experiment": experiment, "arm": arm, "preset": preset, "machine": f"{preset} cores"}
     timed = {"epochs": 100, "standard_error": error, "load_before": load}
     return [{**about, **timed, "pass": i, "seconds": s} for i, s in enumerate(seconds, 1)]
 
@@ -46,10 +46,12 @@ def test_whether_passes_agree_is_said_for_each_preset():
         *measured("source", 1.0, preset="paper"),
     ]
     note = speed_note(rows)
-    assert "highest load before a row 0.499; the passes of 1 of 2 rows agree" in note
+    assert "Preset `fast`, on fast cores: 100 epochs or more, the highest load" in note
+    assert "load before a row 0.499; the passes of 1 of 2 rows agree" in note
     assert "the furthest differ by 20%. " in note
     assert note.endswith(
-        "Preset `paper`: 100 epochs or more, the highest load before a row 0.250, one pass."
+        "Preset `paper`, on paper cores: 100 epochs or more, the highest load before a row 0.250, "
+        "one pass."
     )
     stopped = speed_note([*rows, *measured("source-plain", 1.0)])
     assert "the furthest differ by 20%; 1 of 3 have one pass alone." in stopped
