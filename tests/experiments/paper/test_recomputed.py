@@ -534,8 +534,11 @@ def sentences_of_the_readme():
     source = {steps_taken(source_of(name), "source").shape for name in EXPERIMENTS}
     assert source == {(5, 50)}
     assert len({f"{budget:.1f}" for budget in budgets[2:]}) == 1
-    faint = last_tenth(steps_taken("pp-hetnet", "scratch-published-start", "paper")).mean()
-    started = f" steps from scratch ({faint:.0f} with their initial weights) and "
+    faint = [
+        last_tenth(steps_taken("pp-hetnet", f"{arm}-published-start", "paper"))
+        for arm in ("scratch", "transfer")
+    ]
+    assert [len(seeds) for seeds in faint] == [3, 3]
     return [
         f"{min(HOURS.values())} to {max(HOURS.values())} hours on four processes, take "
         f"{minutes[0]:.0f} to {minutes[1]:.0f} minutes a seed",
@@ -553,8 +556,9 @@ def sentences_of_the_readme():
         f"{np.sum(came)} of {np.size(came)} such seeds come to 30 steps. With the originals' "
         "initial weights none of three does, and transferred all do",
         f"({', '.join(tasks)}: success {', '.join(driven)}, three seeds",
-        f"HetNet takes {by_procedure('pp-hetnet', started)} transferred (the "
-        f"paper: 189.7, 27.1), on Predator-Capture-Prey 3 + 2 "
+        f"HetNet takes {by_procedure('pp-hetnet', ' steps from scratch and ')} transferred (the "
+        f"paper: 189.7, 27.1; with their initial weights {faint[0].mean():.0f} and "
+        f"{faint[1].mean():.0f} in the end), on Predator-Capture-Prey 3 + 2 "
         f"{by_procedure('pcp-hetnet-3p2c', ' and ')} "
         f"(199.9, 25.3), IC3Net {by_procedure('pp-ic3net', ' and ')}: there transfer hurts",
     ]
@@ -640,6 +644,13 @@ def sentences_of_the_ablations():
     assert published[0].shape == (3, 620)
     assert len(ours) == 3
     assert published[0].min() > 150  # of a limit of 200
+
+    def by_the_procedure(arm):
+        taken = steps_taken(het, arm, "paper")
+        assert len(taken) == 3
+        return last_tenth(taken)
+
+    assert np.isinf(epochs_to(het, "transfer-published-start", 30, "paper")).all()
     (level,) = (
         row for row in read("references") if (row["experiment"], row["task"]) == (het, "target")
     )
@@ -671,6 +682,10 @@ def sentences_of_the_ablations():
         f"{ends.mean():.1f} ({ends.min():.1f}-{ends.max():.1f}) steps, a random team at "
         f"{float(level['random_steps_taken']):.0f}, the paper's one run at 189.7; with this "
         f"package's initial weights three come to {ours.mean():.1f}",
+        f"Transferred, it ends at {of_means(by_the_procedure('transfer-published-start'))}, three "
+        f"seeds, none at 30 steps (with our weights {by_the_procedure('transfer').mean():.1f}",
+        f"its source is still at {of_means(by_the_procedure('source-published-start'))} steps on "
+        f"5x5 (ours at {by_the_procedure('source').mean():.1f})",
     ]
 
 
