@@ -19,7 +19,7 @@ from sumajax.experiment.directory import claimed
 from sumajax.experiment.interrupt import stop_when_asked
 from sumajax.experiment.plan import Experiment, Stage, described
 from sumajax.experiment.records import MODES, StageRecords, by_seed, held_out, references
-from sumajax.experiment.summary import stage_labels, summarise, table
+from sumajax.experiment.summary import stage_labels, summarise, table, untrained_line
 from sumajax.keys import key_of
 from sumajax.learning import EPOCH_STEPS, TrainState, make_learner, parallel
 from sumajax.learning.mixed import mixed_with
@@ -259,10 +259,7 @@ class Recorder:
             if not set(name.split("/")) & set(stage.leave_out)
         ]
         if untrained:
-            self.progress.say(
-                f"{stage.name}: {len(untrained)} parameters are as random as they began, the team "
-                f"before has no use for them: {', '.join(untrained)}."
-            )
+            self.progress.say(f"{stage.name}: {untrained_line(untrained)}")
         self.stages.update(stage.name, zero_shot=self._evaluate(stage, params), untrained=untrained)
 
     def _evaluate(self, stage: Stage, params: Any) -> dict[str, dict[str, Any]]:

@@ -1,6 +1,6 @@
 """summary.json and the closing table of a run, from its plan and the records of its stages."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,9 @@ from sumajax.environments.wrapper import unwrapped
 from sumajax.experiment.plan import Experiment, Stage, described
 from sumajax.experiment.records import MODES, StageRecords
 from sumajax.reporting import metrics as metrics_file
+
+NAMED = 3
+"""Parameters that a line names; more are counted, and stages.json has them all."""
 
 
 def summarise(
@@ -94,6 +97,13 @@ def stage_labels(experiment: Experiment) -> dict[str, str]:
 def grid_label(env: Environment) -> str:
     """The task's own grid, as 10x10."""
     return "x".join(map(str, unwrapped(env).state_shape[-2:]))
+
+
+def untrained_line(names: Sequence[str]) -> str:
+    """One sentence about the parameters that the stage before left as they were first drawn."""
+    named, more = ", ".join(names[:NAMED]), len(names) - NAMED
+    others = f" and {more} more (stages.json)" if more > 0 else ""
+    return f"the team before had no use for, so as random as they began: {named}{others}."
 
 
 def table(experiment: Experiment, summary: Mapping[str, Any], records: StageRecords) -> list[Any]:

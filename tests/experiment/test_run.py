@@ -20,7 +20,7 @@ from sumajax.experiment.directory import claimed
 from sumajax.experiment.marl_eval import marl_eval
 from sumajax.experiment.plan import described
 from sumajax.experiment.run import Where
-from sumajax.experiment.summary import table
+from sumajax.experiment.summary import table, untrained_line
 from sumajax.learning import LearnerConfig
 from sumajax.upsampling import StateUpsampled
 
@@ -65,6 +65,15 @@ def rows(directory):
 
 def without_clock(directory):
     return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows(directory)]
+
+
+@pytest.mark.parametrize(
+    ("count", "named"),
+    [(1, "p0."), (3, "p0, p1, p2."), (38, "p0, p1, p2 and 35 more (stages.json).")],
+)
+def test_a_line_names_the_first_parameters_that_nobody_trained_and_counts_the_others(count, named):
+    line = untrained_line([f"p{i}" for i in range(count)])
+    assert line.endswith(f"so as random as they began: {named}")
 
 
 def test_a_run_from_start_to_end(finished):
