@@ -13,6 +13,7 @@ from experiments.paper.statistics import (
     LEAST_SEEDS,
     SOLVED,
     WINDOW_EPOCHS,
+    Accounting,
     Comparison,
     Curves,
     Ratio,
@@ -41,7 +42,7 @@ SOURCE_SOLVED = 10.0
 FEW_HOURS = 10.0
 """Of the paper's hours, that its "few hours after transfer" are read as at most."""
 LONG_HOURS = 400.0
-"""In which the paper's PCP runs from scratch made no progress."""
+"""In which the paper's PCP runs from scratch came to no high performance."""
 CAPTURE = ("pcp-hetnet-2p1c", "pcp-hetnet-3p2c")
 
 RULES = f"""\
@@ -60,17 +61,23 @@ RULES = f"""\
   pair lies above; else it is open. (Means over the last tenth of the epochs.)
 * Q2 of a row: the paper ran each arm once, so it can bear a direction, and a size up to what
   single runs scatter. It holds when every pair scratch/transfer at T lies above {MARGIN:g} and one
-  comes to the paper's ratio; in part when every pair lies above {MARGIN:g} and none comes to it; it
-  does not hold when every pair lies at or below {MARGIN:g}; else it is open.
+  comes to the paper's ratio (with more pairs one does so more easily); in part when every pair lies
+  above {MARGIN:g} and none comes to it; it does not hold when every pair lies at or below
+  {MARGIN:g}; else it is open.
 * "Up to {LARGEST_RATIO:g}x": the rule of Q2 for the row with the largest ratio of all five, once
   all have {LEAST_SEEDS} seeds; one that comes to {LARGEST_RATIO:g} decides it before.
-* "Scratch fails where transfer succeeds", in the rows in which the paper's scratch stayed at
-  {AT_RANDOM:.0%} of the step limit or more and its transfer came near {SOLVED:g}: holds when every
-  transferred seed and no seed from scratch came to {SOLVED:g} steps by T, does not hold when more
-  than half of the seeds from scratch came (who has come, has: no budget is too short for that), in
-  part when fewer came and every transferred seed did.
-* A time is shorter when it is for every pair; who never came within the budget took longer than the
-  budget.
+* "Scratch does not come to {SOLVED:g} steps where transfer does", in the rows in which the paper's
+  scratch stayed at {AT_RANDOM:.0%} of the step limit or more and its transfer came near {SOLVED:g}:
+  holds when every transferred seed and no seed from scratch came there by T, in part when up to
+  half of those from scratch did as well. It does not hold when more than half of the seeds from
+  scratch came (who has come, has: no budget is too short for that), or when by T more than half of
+  the transferred ones did not.
+* "Scratch makes no progress", in every row in which the paper's scratch stayed at
+  {AT_RANDOM:.0%} of the step limit or more: holds when every seed is there too over the last tenth
+  of a budget that goes to T, does not hold when no seed is; else it is open.
+* A time is shorter when it is for every pair. Who never came within a budget took longer than that
+  budget: such a pair counts for the one that came if it came within the other's budget. One left
+  undecided leaves the line "{OPEN}".
 * Over several rows a claim has the verdict that all have, or it is said how many have which.
 * An arm "fell back" when the mean over its last tenth is over {FALLEN_BACK:g} times the least
   mean of {WINDOW_EPOCHS} epochs in a row; no verdict depends on it, but its ratio is worth little.
@@ -103,7 +110,8 @@ def claims(rows: Iterable[Row], preset: str) -> list[Claim]:
         _sooner(known, preset),
         _with_less_experience(known, preset),
         _scratch_fails(known, preset),
-        _no_progress(known, preset),
+        _makes_no_progress(known, preset),
+        _no_high_performance(known, preset),
         _within_hours(known, preset),
     ]
 
@@ -137,7 +145,11 @@ def _longer_on_the_source(rows: list[Row], preset: str) -> Claim:
         return claim
     steps = [arm.env_steps_to(SOURCE_SOLVED) for arm in (upsampled, plain)]
     hours = [arm.cost_to(SOURCE_SOLVED, arm.hours) for arm in (upsampled, plain)]
-    verdict = _sides(_times_pairs(*hours), low=FAILS, high=HOLDS, margin=1.0)
+    with_upsampling, without = (
+        _Times(sample, np.full(len(sample), arm.hours[-1]))
+        for sample, arm in zip(hours, (upsampled, plain), strict=True)
+    )
+    verdict = _sooner_than(without, with_upsampling, yes=HOLDS, no=FAILS)
     ours = " h, ".join(spread(median_of(sample), 3) for sample in hours) + " h"
     reason = (
         f"The paper's hours to {SOURCE_SOLVED:g} steps, with upsampling and without; in M "
@@ -248,7 +260,7 @@ def _sooner(known: Mapping[str, Comparison], preset: str) -> Claim:
         "all five rows, by its hours",
         known,
         preset,
-        lambda compared: compared.times_to(SOLVED, compared.papers_hours),
+        lambda compared: compared.papers_hours,
         "The paper's hours",
     )
 
@@ -259,7 +271,7 @@ def _with_less_experience(known: Mapping[str, Comparison], preset: str) -> Claim
         "said in the conclusion",
         known,
         preset,
-        lambda compared: compared.times_to(SOLVED, compared.env_steps),
+        lambda compared: compared.env_steps,
         "M environment steps",
     )
 
@@ -269,7 +281,7 @@ def _times_claim(
     paper: str,
     known: Mapping[str, Comparison],
     preset: str,
-    times: Callable[[Comparison], tuple[Sample, Sample]],
+    accounting: Callable[[Comparison], Accounting],
     unit: str,
 ) -> Claim:
     """Of every row: transfer came there before scratch did."""
@@ -277,48 +289,83 @@ def _times_claim(
         return Claim(title, preset, paper, "", NOT_RUN, "")
     verdicts, parts = {}, []
     for name, compared in known.items():
-        scratch, transfer = times(compared)
+        by = accounting(compared)
+        scratch, transfer = compared.times_to(SOLVED, by)
         verdicts[name] = OPEN
         if _enough(compared.scratch, compared.transfer):
-            ratios = _times_pairs(scratch, transfer)
-            verdicts[name] = _sides(ratios, low=FAILS, high=HOLDS, margin=1.0)
+            transferred = _Times(transfer, by.transfer[:, -1])
+            from_scratch = _Times(scratch, by.scratch[:, -1])
+            verdicts[name] = _sooner_than(transferred, from_scratch, yes=HOLDS, no=FAILS)
         parts.append(f"{name}: {spread(median_of(scratch), 3)} -> {spread(median_of(transfer), 3)}")
     reason = f"{unit}, scratch -> transfer. Rows: {_rows(verdicts)}."
     return Claim(title, preset, paper, "; ".join(parts), _over(verdicts), reason)
 
 
 def _scratch_fails(known: Mapping[str, Comparison], preset: str) -> Claim:
-    names = [
-        name
-        for name, row in EXPERIMENTS.items()
-        if row.scratch >= AT_RANDOM * row.target.max_steps and row.transfer <= 1.1 * SOLVED
-    ]
-    title = "Scratch fails where transfer succeeds"
+    names = [name for name in _at_random() if EXPERIMENTS[name].transfer <= 1.1 * SOLVED]
+    title = f"Scratch does not come to {SOLVED:g} steps where transfer does"
     paper = f"scratch at random level, transfer near {SOLVED:g} ({', '.join(names)})"
-    verdicts, counts = {}, []
-    for name in names:
-        if name not in known:
-            verdicts[name] = NOT_RUN
-            continue
-        compared = known[name]
-        verdicts[name] = _failing(compared)
-        counts.append(f"{name}: {_came(compared)}")
-    if not counts:
-        return Claim(title, preset, paper, "", NOT_RUN, "")
-    reason = f"Seeds that reached {SOLVED:g} steps within their budgets. Rows: {_rows(verdicts)}."
-    return Claim(title, preset, paper, "; ".join(counts), _over(verdicts), reason)
+    found = {name: known[name] for name in names if name in known}
+    ours = "; ".join(f"{name}: {_came(compared)}" for name, compared in found.items())
+    words = f"Seeds that reached {SOLVED:g} steps within their budgets."
+    return _by_rows(Claim(title, preset, paper, ours, NOT_RUN, words), names, found, _failing)
+
+
+def _makes_no_progress(known: Mapping[str, Comparison], preset: str) -> Claim:
+    title, names = "Scratch makes no progress", _at_random()
+    paper = f"said in the conclusion; at random level ({', '.join(names)})"
+    found = {name: known[name] for name in names if name in known}
+    ours = "; ".join(
+        f"{name}: {spread(mean_of(compared.scratch.last))} of {compared.scratch.step_limit}"
+        for name, compared in found.items()
+    )
+    words = "Steps taken over the last tenth of the budget, of the limit."
+    return _by_rows(Claim(title, preset, paper, ours, NOT_RUN, words), names, found, _still)
+
+
+def _at_random() -> list[str]:
+    """Rows of Table I in which the paper's scratch stayed near the step limit."""
+    return [
+        name for name, row in EXPERIMENTS.items() if row.scratch >= AT_RANDOM * row.target.max_steps
+    ]
+
+
+def _by_rows(
+    claim: Claim,
+    names: Iterable[str],
+    found: Mapping[str, Comparison],
+    verdict: Callable[[Comparison], str],
+) -> Claim:
+    """The claim with the verdict over all rows it is about, those that are not run too."""
+    if not found:
+        return replace(claim, reason="")
+    verdicts = {name: verdict(found[name]) if name in found else NOT_RUN for name in names}
+    reason = f"{claim.reason} Rows: {_rows(verdicts)}."
+    return replace(claim, verdict=_over(verdicts), reason=reason)
 
 
 def _failing(compared: Comparison) -> str:
     scratch, transfer = (arm.came_to(SOLVED) for arm in (compared.scratch, compared.transfer))
-    all_transferred = transfer == len(compared.transfer.filled)
+    seeds = len(compared.transfer.filled)
     if not _enough(compared.scratch, compared.transfer):
         return OPEN
     if 2 * scratch > len(compared.scratch.filled):
         return FAILS
-    if not all_transferred or not _decides(compared):
+    if not _decides(compared):
         return OPEN
+    if transfer < seeds:
+        return FAILS if 2 * transfer < seeds else OPEN
     return IN_PART if scratch else HOLDS
+
+
+def _still(compared: Comparison) -> str:
+    scratch = compared.scratch
+    if not _enough(scratch):
+        return OPEN
+    at_random = scratch.last >= AT_RANDOM * scratch.step_limit
+    if at_random.all():
+        return HOLDS if compared.at_the_papers_hour else OPEN
+    return OPEN if at_random.any() else FAILS
 
 
 def _came(compared: Comparison) -> str:
@@ -326,7 +373,7 @@ def _came(compared: Comparison) -> str:
     return ", ".join(f"{arm.came_to(SOLVED)} of {len(arm.filled)} {words}" for words, arm in arms)
 
 
-def _no_progress(known: Mapping[str, Comparison], preset: str) -> Claim:
+def _no_high_performance(known: Mapping[str, Comparison], preset: str) -> Claim:
     title = f"PCP from scratch: no high performance in over {LONG_HOURS:g} hours"
     paper = "none of its two runs"
     arms = {name: known[name].scratch for name in CAPTURE if name in known}
@@ -358,8 +405,8 @@ def _within_hours(known: Mapping[str, Comparison], preset: str) -> Claim:
     verdicts, parts = {}, []
     for name, arm in arms.items():
         hours = arm.cost_to(SOLVED, arm.hours)
-        few = _sides(hours / FEW_HOURS, low=HOLDS, high=FAILS, margin=1.0)
-        verdicts[name] = few if _enough(arm) else OPEN
+        taken, few = _Times(hours, arm.hours[-1:]), _Times(*2 * (np.array([FEW_HOURS]),))
+        verdicts[name] = _sooner_than(few, taken, yes=FAILS, no=HOLDS) if _enough(arm) else OPEN
         parts.append(f"{name}: {spread(median_of(hours), 3)} h, {_seeds(arm)}")
     reason = (
         f"The paper's hours on the target to {SOLVED:g} steps; few are at most {FEW_HOURS:g}. "
@@ -374,10 +421,33 @@ def _sides(ratios: np.ndarray, low: str, high: str, margin: float = MARGIN) -> s
     return high if above.all() else OPEN if above.any() else low
 
 
-def _times_pairs(first: Sample, second: Sample) -> np.ndarray:
-    """As `pairs`, of times; where neither came, 1: neither was sooner."""
-    with np.errstate(invalid="ignore"):
-        return np.nan_to_num(pairs(first, second), nan=1.0, posinf=math.inf)
+@dataclass(frozen=True)
+class _Times:
+    """Of an arm's seeds until something is reached.
+
+    Attributes:
+      taken: (S,) infinite for a seed that never came.
+      budget: (S,) that each had.
+    """
+
+    taken: Sample
+    budget: Sample
+
+    @property
+    def known(self) -> Sample:
+        """(S,) up to where it is known that a seed had not come, or when it did."""
+        return np.minimum(self.taken, self.budget)
+
+
+def _sooner_than(first: _Times, second: _Times, yes: str, no: str) -> str:
+    """`yes` if every seed of the first came before every one of the second, `no` if none did.
+
+    Open too while a seed that never came may yet have come before the other, or after it.
+    """
+    one, other = first.taken[:, None], second.taken[None, :]
+    came_first = (one <= second.known) & (one < other)
+    came_later = other <= first.known[:, None]
+    return yes if came_first.all() else no if came_later.all() else OPEN
 
 
 def _enough(*arms: Curves) -> bool:

@@ -14,6 +14,7 @@ from experiments.paper.parts import ABLATED, PRESETS, Budget, Part, unchanged_ar
 from experiments.paper.published import EXPERIMENTS, SOURCES
 from experiments.paper.results import Results, write_csv
 from experiments.paper.statistics import (
+    LEAST_SEEDS,
     STATISTICS_COLUMNS,
     THRESHOLDS,
     Accounting,
@@ -48,8 +49,10 @@ COSTS = """\
 Three accountings, the source's cost in each: the paper's hours (epochs times its Table II),
 environment steps, and minutes here (epochs times our Table II: one seed alone). Steps taken are the
 mean over the hour before for the first, over ten epochs before for the others; times are medians
-until an epoch's mean is that low. An interval of a ratio is Student's on logarithms, given with
-three seeds or more in both arms while an arm's seeds all came to 30 steps or none did."""
+until an epoch's mean is that low. The ratio is of those; its interval is of the ratio of geometric
+means, Student's on logarithms, given with three seeds or more in both arms while an arm's seeds all
+came to 30 steps or none did. Minutes are for arms of one preset: each preset's Table II is of one
+machine, not the same for both, and of a later commit than the curves (see Commands)."""
 
 BUDGETS = """\
 Preset `paper`: the paper's pre-training, then until its fixed hour T. Preset `fast`: 1.0 M steps on
@@ -361,7 +364,8 @@ def report(results: Results) -> str:
     lines = [
         "# The paper's evidence, reproduced",
         "Made by `python -m experiments.paper --rebuild` from the rows that are kept beside it; "
-        "nothing in it is written by hand. What was not run says so.",
+        "nothing in it is written by hand. What was not run says so, and is listed under "
+        "[Budgets](#budgets).",
         KEPT,
         "## Claim by claim",
         markdown([_line(claim) for group in by_name.values() for claim in group]),
@@ -379,7 +383,9 @@ def report(results: Results) -> str:
         markdown(costs(results)),
         "### Cost to a number of steps taken",
         markdown(times(results)),
-        "## Table II: seconds per epoch of 20,000 environment steps",
+        "## Table II: seconds per epoch",
+        "An epoch is 20,000 environment steps, under preset `paper` in whole episodes 20 to 24 "
+        "thousand.",
         markdown(table_2(results.rows["seconds_per_epoch"])),
         speed_note(results.rows["seconds_per_epoch"]),
         "## Figure 2",
@@ -403,6 +409,7 @@ def report(results: Results) -> str:
         "## Budgets",
         BUDGETS,
         _budgets(results, known),
+        _not_run(results),
         "## Commands",
         "As they were given at their commits; the program was `experiments/reproduce_paper.py` "
         "before it became `python -m experiments.paper`.",
@@ -447,6 +454,34 @@ def _kept(preset: str, last: Mapping[int, int]) -> str:
     epochs = sorted(set(last.values()))
     seeds = "1 seed" if len(last) == 1 else f"{len(last)} seeds"
     return f"{preset}: {seeds}, {' or '.join(map(str, epochs))} epochs"
+
+
+def _not_run(results: Results) -> str:
+    """Arms of Table I and Q1 with too few seeds for a verdict, and ablations without rows."""
+    lines = []
+    for preset in PRESETS:
+        few = [
+            f"{name} {arm.name} ({len(seeds)} of {LEAST_SEEDS} seeds)"
+            for name in EXPERIMENTS
+            for arm in (SOURCE, SOURCE_PLAIN, TRANSFER, SCRATCH)
+            if (arm.task == "target" or name in SOURCES)
+            and len(seeds := results.last_epochs(Part(name, arm), preset)) < LEAST_SEEDS
+        ]
+        missing = [
+            f"{name} {arm.name}"
+            for name in ABLATED
+            for ablation in ABLATIONS.values()
+            for arm in ablation.variants.values()
+            if not results.last_epochs(Part(name, arm), preset)
+        ]
+        lines += [
+            f"* Preset `{preset}`, {words}: {', '.join(those) or 'none'}."
+            for words, those in (
+                ("with too few seeds for a verdict", few),
+                ("ablations that were not run", missing),
+            )
+        ]
+    return "\n".join(lines)
 
 
 def _configurations(directory: Path) -> str:

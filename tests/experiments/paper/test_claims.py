@@ -10,7 +10,8 @@ from .rows import RESULTS, arms
 
 Q1 = "Q1, PP, IC3Net on the source: upsampling does no harm"
 Q2 = "Q2, PP, IC3Net, 10x10 5P"
-SCRATCH_FAILS = "Scratch fails where transfer succeeds"
+SCRATCH_FAILS = "Scratch does not come to 30 steps where transfer does"
+STILL = "Scratch makes no progress"
 SOONER = "Less aggregate time to a target performance (30 steps), source in"
 LESS = "Less training experience to a target performance (30 steps), source in"
 NO_PROGRESS = "PCP from scratch: no high performance in over 400 hours"
@@ -83,6 +84,19 @@ class TestOneRow:
         assert self.verdicts(scratch=[[20] * 252] * 3)[SOONER] == FAILS
         assert self.verdicts(scratch=[late] * 2 + [[20] * 252])[SOONER] == OPEN
 
+    def test_who_never_came_may_yet_have_come_first(self):
+        """Transferred after 4.9 + 90 * 0.037 of the paper's hours, 8.8 M steps; scratch's budget of
+        252 epochs is 10 of its hours, but 5 M steps.
+        """
+        never, late = [[100] * 252] * 3, [[100] * 89 + [20] * 50] * 3
+        verdicts = self.verdicts(scratch=never, transfer=late)
+        assert verdicts[SOONER] == HOLDS
+        assert verdicts[LESS] == OPEN
+        assert self.verdicts(scratch=never, transfer=[[100] * 139] * 3)[SOONER] == OPEN
+        came = [[100] * 200 + [20] * 52] * 3
+        assert self.verdicts(scratch=came, transfer=[[100] * 139] * 3)[SOONER] == FAILS
+        assert self.verdicts(scratch=came, transfer=[[100] * 10] * 3)[SOONER] == OPEN
+
     def test_a_source_that_still_moves_has_not_converged(self):
         assert self.verdicts()[CONVERGED] == HOLDS
         moving = [9.0] * 280 + [7.0] * 35 + [5.0] * 35
@@ -117,6 +131,29 @@ class TestScratchThatFails:
         assert self.of_the_row([moving] * 3) == OPEN
         assert self.of_the_row([[25] * 100] * 3) == FAILS
 
+    def test_transfer_has_to_succeed(self):
+        scratch, epochs = [[190] * self.EPOCHS["scratch"]] * 3, self.EPOCHS["transfer"]
+        failing, learning = [190] * epochs, [20] * epochs
+        assert self.of_the_row(scratch, [failing] * 3) == FAILS
+        assert self.of_the_row(scratch, [failing] * 2 + [learning]) == FAILS
+        assert self.of_the_row(scratch, [failing] + [learning] * 2) == OPEN
+        assert self.of_the_row(scratch, [[190] * 100] * 3) == FAILS  # settled, if before the hour
+        assert self.of_the_row(scratch, [[190] * 90 + [150] * 10] * 3) == OPEN
+
+    @pytest.mark.parametrize(
+        ("ends", "verdict"), [((190,) * 3, HOLDS), ((170,) * 3, FAILS), ((170, 190, 190), OPEN)]
+    )
+    def test_no_progress_is_a_level_and_not_success(self, ends, verdict):
+        epochs = self.EPOCHS["scratch"]
+        seeds = [[199] * (epochs - epochs // 10) + [end] * (epochs // 10) for end in ends]
+        reason = self.verdicts(seeds)[STILL].reason
+        assert reason.endswith(f"{self.NAME} {verdict}.")
+        assert self.verdicts(seeds[:2])[STILL].verdict == f"{NOT_RUN} in 3, {OPEN} in 1"
+
+    def test_a_short_budget_cannot_show_that_there_is_none(self):
+        assert self.verdicts([[190] * 100] * 3)[STILL].reason.endswith(f"{self.NAME} {OPEN}.")
+        assert self.verdicts([[150] * 100] * 3)[STILL].reason.endswith(f"{self.NAME} {FAILS}.")
+
     def test_over_rows_that_are_not_run(self):
         verdict = self.verdicts([[190] * self.EPOCHS["scratch"]] * 3)[SCRATCH_FAILS].verdict
         assert verdict == f"{NOT_RUN} in 2, {HOLDS} in 1"
@@ -133,6 +170,7 @@ class TestScratchThatFails:
         slow = [[100] * 400 + [25] * 827] * 3
         assert self.verdicts(scratch, slow)[FEW_HOURS].verdict == FAILS
         assert self.verdicts(scratch, slow[:1])[FEW_HOURS].verdict == OPEN
+        assert self.verdicts(scratch, [[100] * 20] * 3)[FEW_HOURS].verdict == OPEN  # 5.8 hours
 
 
 def test_longer_on_the_source_by_the_papers_hours():

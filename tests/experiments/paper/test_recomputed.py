@@ -84,6 +84,11 @@ def steps_taken(name, arm, preset="fast"):
     return curves()[preset, name, arm][0]
 
 
+def steps_had(name, arm):
+    """Millions of environment steps at the end of each epoch, preset `paper`."""
+    return curves()["paper", name, arm][1]
+
+
 def epochs_to(name, arm, threshold=20, preset="fast"):
     """Of every seed; infinite for one that never came."""
     hits = [np.flatnonzero(seed <= threshold) for seed in steps_taken(name, arm, preset)]
@@ -588,7 +593,13 @@ def test_the_words_of_the_page_of_verdicts():
         == ("paper", "pcp-hetnet-3p2c", "scratch/transfer")
         and row["quantity"] == "steps taken at equal cost, source in: the paper's hours"
     )
+    budgets = steps_had("pp-hetnet", "scratch")[:, -1]
+    had, came = steps_had("pp-hetnet", "transfer"), epochs_to("pp-hetnet", "transfer", 30, "paper")
+    source = steps_had("pp-hetnet", "source")[:, -1].mean()
+    sooner = [source + seed[int(epoch) - 1] for seed, epoch in zip(had, came, strict=True)]
     for words in (
+        f"transferred seeds come after {min(sooner):.1f} to {max(sooner):.1f} M steps, scratch's "
+        f"budgets end at {min(budgets):.1f} to {max(budgets):.1f} M",
         f"at the paper's hour all pairs of seeds are {pairs(*pp)} times apart",
         f"Predator-Capture-Prey with 3 + 2 agents holds in part too, {pairs(*pcp)}",
         f"({transfer.mean():.1f} and 25.3 steps)",
