@@ -84,6 +84,11 @@ def _of_own_source(variant: str, share: float = 1.0, **changes: Any) -> Arm:
     return _of_unchanged_source(variant, start=source, **changes)
 
 
+def _started_as_published(variant: str = "", **changes: Any) -> Arm:
+    """The same, with the originals' initial weights of both encoders in all stages."""
+    return _of_own_source(f"published-start{variant}", encoder="flat_published", **changes)
+
+
 AblationName = Literal[
     "corner", "mass", "encoder", "optimiser", "short-source", "lab-gap", "published-start"
 ]
@@ -126,8 +131,15 @@ ABLATIONS: dict[str, Ablation] = {
     ),
     "published-start": Ablation(
         {
-            "(g) encoders started as published, upsampled": _of_own_source(
-                "published-start", encoder="flat_published"
+            "(g) encoders started as published, upsampled": _started_as_published(),
+            "(g) the same, not upsampled: small state in a corner": _started_as_published(
+                "-corner", upsampling="corner"
+            ),
+            "(g) the same, upsampled, all but the state encoder": replace(
+                _started_as_published(),
+                name="transfer-published-start-encoder",
+                zero_shot="zero-shot-published-start-encoder",
+                leave_out=("state_encoder",),
             ),
             "(g) from scratch, encoders started as published": replace(
                 SCRATCH, name="scratch-published-start", encoder="flat_published", brief=True
