@@ -56,9 +56,9 @@ machine, not the same for both, and of a later commit than the curves (see Comma
 
 BUDGETS = """\
 Preset `paper`: the paper's pre-training, then until its fixed hour T. Preset `fast`: 1.0 M steps on
-the source; on the target 2.5 M for IC3Net, 1.2 M for MAGIC, and for HetNet 3.0 M, set after scratch
-had been seen not to learn within 1.2 M (arms `-brief`, kept for Predator-Prey). A budget is stated
-before the run by `experiments/paper/parts.py`."""
+the source; on the target 2.5 M for IC3Net, 1.2 M for MAGIC, and for HetNet 3.0 M, set after not
+every seed from scratch had learnt within 1.2 M (arms `-brief`, kept for Predator-Prey). A budget is
+stated before the run by `experiments/paper/parts.py`."""
 
 
 def write_report(results: Results) -> None:

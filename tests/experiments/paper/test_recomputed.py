@@ -120,11 +120,11 @@ def passes_apart():
     return max(max(seconds) / min(seconds) for seconds in passes().values()) - 1
 
 
-def passes():
+def passes(preset="fast"):
     """Experiment and arm -> seconds an epoch of each pass."""
     found = defaultdict(list)
     for row in read("seconds_per_epoch"):
-        if row["preset"] == "fast":
+        if row["preset"] == preset:
             found[row["experiment"], row["arm"]].append(float(row["seconds"]))
     return found
 
@@ -169,6 +169,7 @@ def main(title):
     ]
 
 
+STARTED = tuple(f"transfer-published-start{variant}" for variant in ("", "-corner", "-encoder"))
 ABLATED = {
     "transferred, as in the paper": ("transfer", "zero-shot"),
     "from scratch": ("scratch", None),
@@ -182,6 +183,8 @@ ABLATED = {
     "(f) the same, source not upsampled": "lab-gap-native",
     "(f) the same from scratch": ("scratch-lab-gap", None),
     "(g) encoders' initial weights as the originals'": "published-start",
+    "(g) the same, source state in a corner": "published-start-corner",
+    "(g) the same, all but the state encoder carried over": "published-start-encoder",
     "(g) the same from scratch": ("scratch-published-start", None),
 }
 
@@ -214,6 +217,40 @@ def ablations(name):
         ]
 
     return row
+
+
+BY_PAPER = {
+    "this package's encoder, transferred": ("source", "transfer"),
+    "the same from scratch": (None, "scratch"),
+    "encoder `lab_gap`, transferred": ("source-lab-gap", "transfer-lab-gap"),
+    "`lab_gap` from scratch": (None, "scratch-lab-gap"),
+    "encoders started as published, transferred": (
+        "source-published-start",
+        "transfer-published-start",
+    ),
+    "as published, transferred, source state in a corner": (
+        "source-published-start-corner",
+        "transfer-published-start-corner",
+    ),
+    "as published, from scratch": (None, "scratch-published-start"),
+}
+
+
+def by_paper(words):
+    """Of HetNet under preset `paper`."""
+    source, arm = BY_PAPER[words]
+    taken = steps_taken("pp-hetnet", arm, "paper")
+    looked = evaluations()["paper", "pp-hetnet", arm, "sampled"]
+    zero_shot = arm.replace("transfer", "zero-shot")
+    looks = evaluations()["paper", "pp-hetnet", zero_shot, "sampled"][0] if source else ()
+    learnt = last_tenth(steps_taken("pp-hetnet", source, "paper")) if source else ()
+    return [
+        f"{len(taken)}",
+        *(of_means(values) if len(values) else "-" for values in (learnt, looks)),
+        never(epochs_to("pp-hetnet", arm, 30, "paper")),
+        of_means(last_tenth(taken)),
+        of_means(looked[1], 3),
+    ]
 
 
 def short_source(epochs):
@@ -272,14 +309,14 @@ CHAINS = {
     ("10x10", None): "pp10-hetnet",
     ("20x20", None): "pp20-hetnet",
     ("40x40", None): "pp40-hetnet",
-    ("20x20", " and 4 capturers"): "pcp20-hetnet",
+    ("20x20", " and 4 capture agents"): "pcp20-hetnet",
 }
 
 
 def larger_grid(title):
     """Of a chain: its stage on such a grid, at the task's limit or the one named, and scratch."""
     grid, capturers, limit = re.match(
-        r"(\d+x\d+), \d+ predators( and \d+ capturers)?, limit (\d+)", title
+        r"(\d+x\d+), \d+ predators( and \d+ capture agents)?, limit (\d+)", title
     ).groups()
     chain = CHAINS[grid, capturers]
     scratch = f"{chain}-scratch"
@@ -405,6 +442,7 @@ TABLES = {
     "main": main,
     "ablations pp-ic3net": ablations("pp-ic3net"),
     "ablations pp-hetnet": ablations("pp-hetnet"),
+    "by the paper's procedure": by_paper,
     "short source": short_source,
     "evaluations pp-ic3net": evaluated("pp-ic3net"),
     "evaluations pp-magic": evaluated("pp-magic"),
@@ -446,8 +484,9 @@ def test_every_table_is_found():
     """With the rows that it is to have."""
     assert {name: len(rows) for name, rows in marked().items()} == {
         "main": 5,
-        "ablations pp-ic3net": 13,
-        "ablations pp-hetnet": 13,
+        "ablations pp-ic3net": 15,
+        "ablations pp-hetnet": 15,
+        "by the paper's procedure": 7,
         "short source": 3,
         "evaluations pp-ic3net": 4,
         "evaluations pp-magic": 4,
@@ -500,6 +539,12 @@ def apart(name, unit):
 def sentences_of_the_readme():
     of_seeds = [curves()["paper", name, "scratch"][2][:, -1] / 60 for name in EXPERIMENTS]
     minutes = min(map(min, of_seeds)), max(map(max, of_seeds))
+    quiet = [
+        np.mean(passes("paper")[name, "scratch"])
+        / 60
+        * steps_taken(name, "scratch", "paper").shape[1]
+        for name in EXPERIMENTS
+    ]
     levels = [row for row in read("references") if row["task"] == "target"]
     random, paths = (
         [float(row[column]) for row in levels]
@@ -520,21 +565,25 @@ def sentences_of_the_readme():
     assert not any(apart(name, "steps") for name in EXPERIMENTS[3:])
     assert [apart(name, "hours") for name in EXPERIMENTS] == [False, False, True, True, True]
     hours, here = (by_rows(lambda name, u=unit: ratio(name, u)) for unit in ("hours", "minutes"))
-    came = [np.isfinite(epochs_to(name, "scratch", 30)) for name in EXPERIMENTS[2:]]
-    published = [
-        np.isfinite(epochs_to("pp-hetnet", f"{arm}-published-start", 30))
-        for arm in ("scratch", "transfer")
-    ]
-    assert [came.tolist() for came in published] == [3 * [False], 3 * [True]]
+    came = [np.isfinite(epochs_to(name, "scratch", 30)) for name in EXPERIMENTS[1:]]
+    brief = {
+        arm: int(np.isfinite(epochs_to("pp-hetnet", arm, 30)).sum())
+        for arm in ("scratch-brief", "scratch-published-start", *STARTED)
+    }
+    assert brief == {"scratch-brief": 4, "scratch-published-start": 0, **dict.fromkeys(STARTED, 3)}
+    upsampled, corner, _ = (epochs_to("pp-hetnet", arm, 30) for arm in STARTED)
+    assert max(upsampled) < min(corner)
     tasks = LESSONS.values()
     driven = [junction(f"`{task}/{task}-sharp`")[2].split()[0] for task in tasks]
     late = np.isinf([epochs_to(name, "scratch") for name in EXPERIMENTS[3:]])
     assert late.sum() == 1
-    scratch, transfer = (
-        evaluations()["fast", "pcp-hetnet-3p2c", arm, "sampled"][0]
-        for arm in ("scratch", "transfer")
-    )
-    assert max(transfer) < min(scratch)
+    ahead = []
+    for name in EXPERIMENTS:
+        scratch, transfer = (
+            evaluations()["fast", name, arm, "sampled"][0] for arm in ("scratch", "transfer")
+        )
+        ahead.append(max(transfer) < min(scratch))
+    assert ahead == [True, True, False, False, True]
     budgets = [steps_taken(name, "scratch").shape[1] * EPOCH for name in EXPERIMENTS]
     source = {steps_taken(source_of(name), "source").shape for name in EXPERIMENTS}
     assert source == {(5, 50)}
@@ -544,9 +593,16 @@ def sentences_of_the_readme():
         for arm in ("scratch", "transfer")
     ]
     assert [len(seeds) for seeds in faint] == [3, 3]
+    ours = ("pp-hetnet", "pcp-hetnet-3p2c", "pp-ic3net")
+    more = [times_the_epochs(name) for name in ours]
+    _, *ic3net = at_the_hour("pp-ic3net", "paper")
+    assert max(ic3net[0]) < min(ic3net[1])
+    source = steps_had("pp-ic3net", "source")[:, -1]
+    assert source.min() > steps_had("pp-ic3net", "scratch")[:, -1].max()
     return [
-        f"{min(HOURS.values())} to {max(HOURS.values())} hours on four processes, take "
-        f"{minutes[0]:.0f} to {minutes[1]:.0f} minutes a seed",
+        f"{min(HOURS.values())} to {max(HOURS.values())} hours on four processes, took "
+        f"{minutes[0]:.0f} to {minutes[1]:.0f} minutes a seed here on two shared cores "
+        f"({min(quiet):.0f} to {max(quiet):.0f} alone)",
         f"{50 * EPOCH:.1f} M environment steps on 5x5, then {budgets[0]:.1f} M (IC3Net), "
         f"{budgets[1]:.1f} M (MAGIC) or {budgets[2]:.1f} M (HetNet) on 10x10",
         f"A random team takes {min(random):.0f} to {max(random):.0f}, shortest paths "
@@ -555,25 +611,70 @@ def sentences_of_the_readme():
         f"within {apart_at_the_end:.1f} steps of each other on Predator-Prey",
         f"scratch needs {min(pp):.2f} to {max(pp):.2f} times the environment steps, on "
         f"Predator-Capture-Prey {pcp[0]:.1f} times (ranges overlap)",
-        f"Scratch takes {hours[0]:.1f} to {hours[1]:.1f} times the paper's hours",
-        f"{here[0]:.2f} to {here[1]:.1f} times the minutes here (two passes, at most "
+        f"Scratch takes {hours[0]:.1f} to {hours[1]:.1f} times as many of the paper's hours",
+        f"{here[0]:.2f} to {here[1]:.1f} times the minutes here (timed twice, at most "
         f"{100 * passes_apart():.0f}% apart)",
-        f"{np.sum(came)} of {np.size(came)} such seeds come to 30 steps. With the originals' "
-        "initial weights none of three does, and transferred all do",
+        f"{np.sum(came)} of {np.size(came)} such seeds come to 30 steps",
+        f"Of 5 runs of 1.2 M steps (HetNet, Predator-Prey) {brief['scratch-brief']} do",
         f"({', '.join(tasks)}: success {', '.join(driven)}, three seeds",
-        f"HetNet takes {by_procedure('pp-hetnet', ' steps from scratch and ')} transferred (the "
-        f"paper: 189.7, 27.1; with their initial weights {faint[0].mean():.0f} and "
-        f"{faint[1].mean():.0f} in the end), on Predator-Capture-Prey 3 + 2 "
-        f"{by_procedure('pcp-hetnet-3p2c', ' and ')} "
-        f"(199.9, 25.3), IC3Net {by_procedure('pp-ic3net', ' and ')}: there transfer hurts",
+        f"with {min(more):.1f} to {max(more):.1f} times the epochs",
+        f"HetNet {by_procedure('pp-hetnet')}; {at_equal_steps('pp-hetnet')} (the paper 189.7 and "
+        f"27.1). Predator-Capture-Prey 3 + 2 {by_procedure('pcp-hetnet-3p2c')}; "
+        f"{at_equal_steps('pcp-hetnet-3p2c')} (199.9 and 25.3). IC3Net "
+        f"{by_procedure('pp-ic3net')} (55.6 and 20.7)",
+        f"weights end at {faint[0].mean():.0f} from scratch and {faint[1].mean():.0f} transferred",
+        *sentences_of_larger_grids(),
     ]
 
 
-def by_procedure(name, between):
+def sentences_of_larger_grids():
+    cost = {
+        name: on_20x20(f"`{name}`")[-2:] + on_20x20(f"`{name}`")[:1]
+        for name in ("pp20-hetnet", "short-hetnet", "brief-hetnet", "pp20-hetnet-scratch")
+    }
+    assert cost["brief-hetnet"] == ["never", "never", "3"]
+    steps, seconds = (
+        {name: figures[i].split()[0] for name, figures in cost.items()} for i in range(2)
+    )
+    bound = 2 * float(kept("stages", task="20x20 10P")[0]["bound"])
+    chain, short, _, scratch = cost
+    return [
+        f"To {bound:.0f} steps at limit 200 (128 starts), sources in, a chain takes {steps[chain]} "
+        f"M steps and {seconds[chain]} CPU seconds, with sources of 0.5 M each {steps[short]} M "
+        f"and {seconds[short]}, of 0.3 M it never comes; scratch takes {steps[scratch]} M and "
+        f"{seconds[scratch]}",
+    ]
+
+
+def times_the_epochs(name):
+    """That the transferred arm has had with its source, of scratch's, at the paper's hour."""
+    source = steps_had(source_of(name), "source").shape[1]
+    seconds, hour = SECONDS[name], HOURS[name] * 3600
+    on_target = (hour - source * seconds[0]) // seconds[1]
+    return (source + on_target) / (hour // seconds[2])
+
+
+def at_equal_steps(name):
+    """From scratch and transferred, preset `paper`, means of ten epochs before the largest number
+    of environment steps that both have, the source's in.
+    """
+    source = steps_had(source_of(name), "source")[:, -1].mean()
+    had = {arm: steps_had(name, arm).mean(0) for arm in ("scratch", "transfer")}
+    had["transfer"] = had["transfer"] + source
+    at = min(steps[-1] for steps in had.values())
+    window = 10 * had["scratch"][-1] / len(had["scratch"])
+    taken = []
+    for arm, steps in had.items():
+        inside = (steps > at - window + 1e-9) & (steps <= at + 1e-9)
+        taken.append(steps_taken(name, arm, "paper")[:, inside].mean())
+    return "{:.1f} and {:.1f}".format(*taken)
+
+
+def by_procedure(name):
     """From scratch and transferred at the paper's hour, preset `paper`, of three seeds each."""
     _, *arms = at_the_hour(name, "paper")
     assert [len(arm) for arm in arms] == [3, 3]
-    return between.join(f"{arm.mean():.1f}" for arm in arms)
+    return " and ".join(map(of_means, arms))
 
 
 def test_the_words_of_the_page_of_verdicts():
@@ -619,7 +720,8 @@ def sentences_of_the_ablations():
     def whole(name, words, source):
         return f"{median(epochs_to(name, ablated(name, words)[0])) * EPOCH + source:.2f} M"
 
-    first, scratch, corner, *_, quarter, pooled, native, _, started, started_scratch = ABLATED
+    first, scratch, corner, *_, quarter, pooled, native, _ = list(ABLATED)[:-4]
+    started, in_a_corner, no_encoder, started_scratch = list(ABLATED)[-4:]
     ic3, het = "pp-ic3net", "pp-hetnet"
 
     def overlap(name, words, other, of=lambda taken: taken.mean(1)):
@@ -628,6 +730,8 @@ def sentences_of_the_ablations():
 
     assert [overlap(name, corner, first) for name in (ic3, het)] == [True, False]
     assert [overlap(name, pooled, native) for name in (ic3, het)] == [False, False]
+    assert [overlap(name, in_a_corner, started) for name in (ic3, het)] == [True, False]
+    assert [overlap(name, no_encoder, started) for name in (ic3, het)] == [False, False]
     for name in (ic3, het):
         end = last_tenth(steps_taken(name, ablated(name, first)[0])).mean()
         for words in ABLATED:
@@ -648,23 +752,21 @@ def sentences_of_the_ablations():
         return median(epochs_to(name, ablated(name, words)[0])) * EPOCH
 
     later = to_20(ic3, started_scratch) - to_20(ic3, scratch)
-    published = curves()["paper", het, "scratch-published-start"]
-    ends, ours = (
-        last_tenth(taken) for taken in (published[0], steps_taken(het, "scratch", "paper"))
+    assert to_20(het, in_a_corner) == to_20(het, no_encoder)
+    late = np.concatenate(
+        [last_tenth(steps_taken(het, ablated(het, w)[0])) for w in (in_a_corner, no_encoder)]
     )
-    assert published[0].shape == (3, 620)
-    assert len(ours) == 3
-    assert published[0].min() > 150  # of a limit of 200
-
-    def by_the_procedure(arm):
-        taken = steps_taken(het, arm, "paper")
-        assert len(taken) == 3
-        return last_tenth(taken)
-
-    assert np.isinf(epochs_to(het, "transfer-published-start", 30, "paper")).all()
+    published = steps_taken(het, "scratch-published-start", "paper")
+    had = steps_had(het, "scratch-published-start")[:, -1].mean()
+    assert published.shape == (3, 620)
+    assert published.min() > 150  # of a limit of 200
     (level,) = (
         row for row in read("references") if (row["experiment"], row["task"]) == (het, "target")
     )
+    for arm in (arms for _, arms in list(BY_PAPER.values())[2:] if arms.startswith("transfer")):
+        taken = steps_taken(het, arm, "paper")
+        assert np.isinf(epochs_to(het, arm, 30, "paper")).all()
+        assert last_tenth(taken).max() < last_tenth(published).min() / 2
     return [
         f"a policy starts the target at {zero_shot(ic3, corner)} (IC3Net) and "
         f"{zero_shot(het, corner)} steps (HetNet) where an upsampled one starts at "
@@ -674,7 +776,11 @@ def sentences_of_the_ablations():
         f"not; from scratch it is {way(ic3, scratch)} and {way(het, scratch)}",
         f"({ends_at(het, started_scratch)} at the end; with this package's initial weights it "
         f"comes to {ends_at(het, scratch)})",
-        f"at 20 steps after {to_20(het, started):.2f} M and ends at {ends_at(het, started, 1)}",
+        f"at 20 steps after {to_20(het, started):.2f} M, it ends at {ends_at(het, started, 1)}",
+        f"HetNet is at 20 steps after {to_20(het, in_a_corner):.2f} M without upsampling too",
+        f"all six seeds end at {late.min():.1f} to {late.max():.1f}",
+        f"({way(ic3, started)} against {way(ic3, in_a_corner)} steps on the way, ranges overlap)",
+        f"by the encoder ({way(ic3, no_encoder)}, ranges apart)",
         f"IC3Net does learn from scratch, {later:.1f} M steps later than with our weights",
         f"({zero_shot(ic3, pooled)} against {zero_shot(ic3, native)} and {zero_shot(het, pooled)} "
         f"against {zero_shot(het, native)} steps)",
@@ -689,14 +795,9 @@ def sentences_of_the_ablations():
             )
         ),
         f"with the source's {curves()['paper', ic3, 'source-25'][1][:, -1].mean():.1f} M counted",
-        f"(620 epochs, {published[1][:, -1].mean():.1f} M steps) three seeds are at "
-        f"{ends.mean():.1f} ({ends.min():.1f}-{ends.max():.1f}) steps, a random team at "
-        f"{float(level['random_steps_taken']):.0f}, the paper's one run at 189.7; with this "
-        f"package's initial weights three come to {ours.mean():.1f}",
-        f"Transferred, it ends at {of_means(by_the_procedure('transfer-published-start'))}, three "
-        f"seeds, none at 30 steps (with our weights {by_the_procedure('transfer').mean():.1f}",
-        f"its source is still at {of_means(by_the_procedure('source-published-start'))} steps on "
-        f"5x5 (ours at {by_the_procedure('source').mean():.1f})",
+        f"after the whole budget ({had:.1f} M steps) three seeds are at "
+        f"{of_means(last_tenth(published))} steps, a random team at "
+        f"{float(level['random_steps_taken']):.0f}, the paper's one run at 189.7",
     ]
 
 
