@@ -175,8 +175,15 @@ def train(options: Options, results: Results) -> None:
     missing = {part: missing_seeds(part, options, results) for part in parts}
     for part in parts:
         needed = missing[part] | _needed_by(part, missing, options, results)
-        for seeds, source in groups(part, needed, options, results):
+        found = groups(part, needed, options, results)
+        for seeds, source in found:
             train_part(part, seeds, source, options, results)
+        if lost := needed - {seed for seeds, _ in found for seed in seeds}:
+            print(
+                f"{part}: not run with seeds {' '.join(map(str, sorted(lost)))}, of which "
+                f"{part.source} has no checkpoint.",
+                flush=True,
+            )
 
 
 def missing_seeds(part: Part, options: Options, results: Results) -> set[int]:

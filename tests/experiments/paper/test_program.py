@@ -73,6 +73,19 @@ def test_a_part_without_a_seed_left_is_told_of_and_the_others_go_on(tiny, monkey
     assert "no seed" in json.loads(file.read_text())["sessions"][-1]["stopped"]
 
 
+def test_what_has_no_source_to_go_on_from_is_told_of(tiny, monkeypatch, capsys):
+    def run_experiment(experiment, directory, where):
+        if experiment.stages[0].name == "source":
+            raise StoppedError("no seed of the source stage is left.")
+        pretend(experiment, directory, where)
+
+    monkeypatch.setattr(program, "run_experiment", run_experiment)
+    run(tiny)
+    told = "pp-ic3net transfer: not run with seeds 0, of which pp-ic3net source has no checkpoint."
+    assert told in capsys.readouterr().out
+    assert {r["arm"] for r in Results.read(tiny.output).rows["curves"]} == {"scratch"}
+
+
 @pytest.mark.slow
 def test_a_part_that_was_stopped_goes_on_and_its_rows_are_kept(tiny, monkeypatch):
     """Stopped as a kill between a chunk's rows and its checkpoint would."""
