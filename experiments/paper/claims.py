@@ -364,7 +364,8 @@ def _still(compared: Comparison) -> str:
         return OPEN
     at_random = scratch.last >= AT_RANDOM * scratch.step_limit
     if at_random.all():
-        return HOLDS if compared.at_the_papers_hour else OPEN
+        whole = scratch.hours[-1] + scratch.hours[0] > compared.row.hours  # T lies in an epoch
+        return HOLDS if whole else OPEN
     return OPEN if at_random.any() else FAILS
 
 
@@ -402,10 +403,10 @@ def _within_hours(known: Mapping[str, Comparison], preset: str) -> Claim:
     arms = {name: known[name].transfer for name in CAPTURE if name in known}
     if not arms:
         return Claim(title, preset, paper, "", NOT_RUN, "")
-    verdicts, parts = {}, []
+    verdicts, parts, limit = {}, [], np.array([FEW_HOURS])
     for name, arm in arms.items():
         hours = arm.cost_to(SOLVED, arm.hours)
-        taken, few = _Times(hours, arm.hours[-1:]), _Times(*2 * (np.array([FEW_HOURS]),))
+        few, taken = _Times(limit, limit), _Times(hours, arm.hours[-1:])
         verdicts[name] = _sooner_than(few, taken, yes=FAILS, no=HOLDS) if _enough(arm) else OPEN
         parts.append(f"{name}: {spread(median_of(hours), 3)} h, {_seeds(arm)}")
     reason = (
