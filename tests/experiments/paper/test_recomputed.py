@@ -798,6 +798,9 @@ def sentences_of_the_ablations():
         f"after the whole budget ({had:.1f} M steps) three seeds are at "
         f"{of_means(last_tenth(published))} steps, a random team at "
         f"{float(level['random_steps_taken']):.0f}, the paper's one run at 189.7",
+        f"slow and uneven ({last_tenth(steps_taken(het, 'scratch-lab-gap', 'paper')).mean():.1f}), "
+        "transferred all seeds are alike "
+        f"({last_tenth(steps_taken(het, 'transfer-lab-gap', 'paper')).mean():.1f})",
     ]
 
 
