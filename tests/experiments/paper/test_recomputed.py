@@ -589,10 +589,10 @@ def sentences_of_the_readme():
     assert source == {(5, 50)}
     assert len({f"{budget:.1f}" for budget in budgets[2:]}) == 1
     faint = [
-        last_tenth(steps_taken("pp-hetnet", f"{arm}-published-start", "paper"))
-        for arm in ("scratch", "transfer")
+        last_tenth(steps_taken("pp-hetnet", arm, "paper"))
+        for arm in ("scratch-published-start", *STARTED[:2])
     ]
-    assert [len(seeds) for seeds in faint] == [3, 3]
+    assert [len(seeds) for seeds in faint] == [3, 3, 3]
     ours = ("pp-hetnet", "pcp-hetnet-3p2c", "pp-ic3net")
     more = [times_the_epochs(name) for name in ours]
     _, *ic3net = at_the_hour("pp-ic3net", "paper")
@@ -622,7 +622,8 @@ def sentences_of_the_readme():
         f"27.1). Predator-Capture-Prey 3 + 2 {by_procedure('pcp-hetnet-3p2c')}; "
         f"{at_equal_steps('pcp-hetnet-3p2c')} (199.9 and 25.3). IC3Net "
         f"{by_procedure('pp-ic3net')} (55.6 and 20.7)",
-        f"weights end at {faint[0].mean():.0f} from scratch and {faint[1].mean():.0f} transferred",
+        f"weights end at {faint[0].mean():.0f} from scratch, {faint[1].mean():.0f} transferred and "
+        f"{faint[2].mean():.0f} without upsampling",
         *sentences_of_larger_grids(),
     ]
 
@@ -756,6 +757,8 @@ def sentences_of_the_ablations():
     late = np.concatenate(
         [last_tenth(steps_taken(het, ablated(het, w)[0])) for w in (in_a_corner, no_encoder)]
     )
+    upsampled, cornered = (last_tenth(steps_taken(het, arm, "paper")) for arm in STARTED[:2])
+    assert min(cornered) <= max(upsampled)
     published = steps_taken(het, "scratch-published-start", "paper")
     had = steps_had(het, "scratch-published-start")[:, -1].mean()
     assert published.shape == (3, 620)
@@ -798,6 +801,8 @@ def sentences_of_the_ablations():
         f"after the whole budget ({had:.1f} M steps) three seeds are at "
         f"{of_means(last_tenth(published))} steps, a random team at "
         f"{float(level['random_steps_taken']):.0f}, the paper's one run at 189.7",
+        f"Without upsampling a transfer ends at {cornered.mean():.1f} where it ends at "
+        f"{upsampled.mean():.1f} with it, and their ranges overlap",
         f"slow and uneven ({last_tenth(steps_taken(het, 'scratch-lab-gap', 'paper')).mean():.1f}), "
         "transferred all seeds are alike "
         f"({last_tenth(steps_taken(het, 'transfer-lab-gap', 'paper')).mean():.1f})",
