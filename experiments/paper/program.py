@@ -66,7 +66,7 @@ class Options:
 
     experiments: tuple[Selection, ...] = TABLE_1
     """Rows of Table I; q1: the source tasks without upsampling; and the ablations of PP with IC3Net
-    and HetNet: corner, mass, encoder, optimiser, short-source, lab-gap."""
+    and HetNet: corner, mass, encoder, optimiser, short-source, lab-gap, published-start."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Trained side by side; seeds that are added later are run alone."""
     preset: PresetName = "fast"
