@@ -357,10 +357,6 @@ def _ablated(results: Results, name: str, arm: Arm, preset: str) -> dict[str, st
 def report(results: Results) -> str:
     """README.md: claim by claim, then tables, budgets and commands."""
     known = presets(results) or list(PRESETS)
-    found = [claim for preset in PRESETS for claim in claims(results.rows["curves"], preset)]
-    by_name: dict[str, list[Claim]] = {}
-    for claim in found:
-        by_name.setdefault(claim.name, []).append(claim)
     lines = [
         "# The paper's evidence, reproduced",
         "Made by `python -m experiments.paper --rebuild` from the rows that are kept beside it; "
@@ -368,7 +364,7 @@ def report(results: Results) -> str:
         "[Budgets](#budgets).",
         KEPT,
         "## Claim by claim",
-        markdown([_line(claim) for group in by_name.values() for claim in group]),
+        _claims(results),
         "What they were under the rules before these: [docs/verdicts.md](../../docs/verdicts.md).",
         "### How a verdict is found",
         RULES,
@@ -419,6 +415,15 @@ def report(results: Results) -> str:
     return "\n\n".join(line.rstrip("\n") for line in lines) + "\n"
 
 
+def _claims(results: Results) -> str:
+    """Every claim, both presets of one below each other."""
+    by_name: dict[str, list[Claim]] = {}
+    for preset in PRESETS:
+        for claim in claims(results.rows["curves"], preset):
+            by_name.setdefault(claim.name, []).append(claim)
+    return markdown([_line(claim) for group in by_name.values() for claim in group])
+
+
 def _line(claim: Claim) -> dict[str, str]:
     return {
         "claim": claim.name,
@@ -433,21 +438,28 @@ def _line(claim: Claim) -> dict[str, str]:
 def _budgets(results: Results, known: Iterable[str]) -> str:
     """Epochs per arm: the paper's, those of `fast`, and those that the kept curves have."""
     rows = []
-    for name, row in EXPERIMENTS.items():
-        for arm in (SOURCE, SOURCE_PLAIN, TRANSFER, SCRATCH):
-            if arm.task == "source" and name not in SOURCES:
-                continue
-            kept = {preset: results.last_epochs(Part(name, arm), preset) for preset in known}
-            rows.append(
-                {
-                    "experiment": row.title,
-                    "arm": arm.name,
-                    "preset paper": Budget("paper").epochs(Part(name, arm)),
-                    "preset fast": Budget("fast").epochs(Part(name, arm)),
-                    "kept": "; ".join(_kept(*item) for item in kept.items() if item[1]) or NOT_RUN,
-                }
-            )
+    for part in _parts_with_verdicts():
+        kept = {preset: results.last_epochs(part, preset) for preset in known}
+        rows.append(
+            {
+                "experiment": EXPERIMENTS[part.experiment].title,
+                "arm": part.arm.name,
+                "preset paper": Budget("paper").epochs(part),
+                "preset fast": Budget("fast").epochs(part),
+                "kept": "; ".join(_kept(*item) for item in kept.items() if item[1]) or NOT_RUN,
+            }
+        )
     return markdown(rows)
+
+
+def _parts_with_verdicts() -> list[Part]:
+    """The arms of Table I and of question Q1."""
+    return [
+        Part(name, arm)
+        for name in EXPERIMENTS
+        for arm in (SOURCE, SOURCE_PLAIN, TRANSFER, SCRATCH)
+        if arm.task == "target" or name in SOURCES
+    ]
 
 
 def _kept(preset: str, last: Mapping[int, int]) -> str:
@@ -461,18 +473,16 @@ def _not_run(results: Results) -> str:
     lines = []
     for preset in PRESETS:
         few = [
-            f"{name} {arm.name} ({len(seeds)} of {LEAST_SEEDS} seeds)"
-            for name in EXPERIMENTS
-            for arm in (SOURCE, SOURCE_PLAIN, TRANSFER, SCRATCH)
-            if (arm.task == "target" or name in SOURCES)
-            and len(seeds := results.last_epochs(Part(name, arm), preset)) < LEAST_SEEDS
+            f"{part} ({len(seeds)} of {LEAST_SEEDS} seeds)"
+            for part in _parts_with_verdicts()
+            if len(seeds := results.last_epochs(part, preset)) < LEAST_SEEDS
         ]
         missing = [
-            f"{name} {arm.name}"
+            str(part)
             for name in ABLATED
             for ablation in ABLATIONS.values()
-            for arm in ablation.variants.values()
-            if not results.last_epochs(Part(name, arm), preset)
+            for part in (Part(name, arm) for arm in ablation.variants.values())
+            if not results.last_epochs(part, preset)
         ]
         lines += [
             f"* Preset `{preset}`, {words}: {', '.join(those) or 'none'}."

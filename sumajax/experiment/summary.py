@@ -11,7 +11,7 @@ from sumajax.experiment.plan import Experiment, Stage, described
 from sumajax.experiment.records import MODES, StageRecords
 from sumajax.reporting import metrics as metrics_file
 
-NAMED = 3
+MOST_NAMED = 3
 """Parameters that a line names; more are counted, and stages.json has them all."""
 
 
@@ -101,7 +101,7 @@ def grid_label(env: Environment) -> str:
 
 def untrained_line(names: Sequence[str]) -> str:
     """One sentence about the parameters that the stage before left as they were first drawn."""
-    named, more = ", ".join(names[:NAMED]), len(names) - NAMED
+    named, more = ", ".join(names[:MOST_NAMED]), len(names) - MOST_NAMED
     others = f" and {more} more (stages.json)" if more > 0 else ""
     return f"the team before had no use for, so as random as they began: {named}{others}."
 
